@@ -14,16 +14,27 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
-from flint import arb
+from flint import acb, arb
 
-from malta.linear.expressions import KNOWN_OPERATIONS, POINTS, Arithmetic, MatrixProgram, NotAnalytic, program
+from malta.linear.expressions import (
+    KNOWN_OPERATIONS,
+    POINTS,
+    Arithmetic,
+    MatrixProgram,
+    NotAnalytic,
+    RootEntry,
+    Step,
+    program,
+)
 
 _OTHER_SYMBOL_OPERATIONS: dict[str, Any] = {
     name: getattr(ca, name) for name in KNOWN_OPERATIONS if hasattr(ca, name)
 }
 
 
-SYMBOLS = Arithmetic(ca.SX, {**_OTHER_SYMBOL_OPERATIONS, "pow": ca.power})
+SYMBOLS = Arithmetic(
+    ca.SX, {**_OTHER_SYMBOL_OPERATIONS, "pow": ca.power, "root": lambda entry, p: entry.at_symbols(p)}
+)
 
 
 class Interval:
@@ -78,7 +89,14 @@ def _by_balls(function: Callable[..., Any]) -> Callable[..., Interval]:
     return found
 
 
-INTERVALS = Arithmetic(lambda x: Interval(x, x), {name: _by_balls(f) for name, f in POINTS.others.items()})
+def _root_of_intervals(entry: RootEntry, p: Sequence[Interval]) -> Interval:
+    return _by_balls(lambda *z: entry.enclosure([acb(x) for x in z], is_one=False).real)(*p)
+
+
+INTERVALS = Arithmetic(
+    lambda x: Interval(x, x),
+    {**{name: _by_balls(f) for name, f in POINTS.others.items()}, "root": _root_of_intervals},
+)
 
 
 class _Undecided(Exception):
@@ -94,7 +112,7 @@ class _Resolved:
     def __init__(self, nominal: Sequence[float], signs: Sequence[int] | None = None) -> None:
         self.nominal, self.signs = nominal, signs
         self.chosen: dict[Any, int] = {}
-        self.steps: list[tuple[str, int, tuple[int, ...], float]] = []
+        self.steps: list[Step] = []
         self.values: list[Any] = []  # None: not known
         self.positive: list[int] = []
 

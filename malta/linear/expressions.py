@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple
 
 import casadi as ca
-from flint import acb, arb, fmpq
+from flint import acb, acb_mat, arb, fmpq
 
 from malta.errors import InputError
+from malta.linear.implicit import PREFIX, ImplicitRoot, Slopes, call, root_equations, root_value
 
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
 FIELD: dict[str, Callable[..., Any]] = {  # operations of any field
@@ -50,11 +51,14 @@ def exact(x: float) -> Any:
     return fmpq(*float(x).as_integer_ratio())
 
 
+Step = tuple[str, int, tuple[int, ...], Any]  # operation, target, operands; a constant, a power, a RootEntry
+
+
 @dataclass(frozen=True, eq=False)
 class MatrixProgram:
     """Matrices of scalar expressions in p: instructions (operation, target, operands, constant) on numbered cells."""
 
-    steps: tuple[tuple[str, int, tuple[int, ...], float], ...]
+    steps: tuple[Step, ...]
     entries: tuple[tuple[tuple[int, int, int], ...], ...]  # of each matrix: row, column, step that made it
     shapes: tuple[tuple[int, int], ...]
     inputs: int
@@ -73,6 +77,11 @@ class MatrixProgram:
     def foreign(self) -> tuple[str, ...]:
         """Operations that have no complex extension: if_else, abs, floor, ..."""
         return tuple(sorted({name for name, *_ in self.steps if name not in KNOWN_OPERATIONS}))
+
+    @cached_property
+    def implicit(self) -> bool:
+        """Whether roots of equations are among the operations."""
+        return any(name == "root" for name, *_ in self.steps)
 
     @cached_property
     def reach(self) -> tuple[frozenset[int], ...]:
@@ -143,12 +152,14 @@ class Arithmetic:
         self.constant = constant
         self.others = others
 
-    def apply(self, name: str, operands: list[Any], value: float) -> Any:
+    def apply(self, name: str, operands: list[Any], value: Any) -> Any:
         try:
             if name in FIELD:
                 return FIELD[name](*operands)
             if name == "constpow":
                 return self._power(operands[0], value)
+            if name == "root" and name in self.others:
+                return self.others[name](value, operands)
             if name in self.others:
                 return self.others[name](*operands)
         except ZeroDivisionError as error:
@@ -227,12 +238,12 @@ def finite(z: Any) -> Any:
 _BALLS: dict[str, Callable[..., Any]] = {
     "sin": lambda z: z.sin(),
     "cos": lambda z: z.cos(),
-    "tan": lambda z: finite(z.sin() / z.cos()),
+    "tan": lambda z: finite(z.tan()),
     "exp": lambda z: z.exp(),
     "expm1": lambda z: z.exp() - 1,
     "sinh": lambda z: z.sinh(),
     "cosh": lambda z: z.cosh(),
-    "tanh": lambda z: finite(z.sinh() / z.cosh()),
+    "tanh": lambda z: finite(z.tanh()),
     "sqrt": lambda z: _require_off_cut(z).sqrt(),
     "log": lambda z: _require_off_cut(z).log(),
     "log1p": lambda z: _require_off_cut(z + 1).log(),
@@ -247,7 +258,7 @@ _BALLS: dict[str, Callable[..., Any]] = {
     "erf": lambda z: z.erf(),
     "hypot": lambda a, b: _require_off_cut(a * a + b * b).sqrt(),
 }
-KNOWN_OPERATIONS = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
+KNOWN_OPERATIONS = frozenset({*FIELD, *_BALLS, "const", "input", "constpow", "root"})
 EXACT_ARITHMETIC = Arithmetic(exact, {})
 
 
@@ -259,9 +270,56 @@ def _ball(x: float) -> Any:
 class _Checked(Arithmetic):
     """The arithmetic of balls, in which quotients must be finite."""
 
-    def apply(self, name: str, operands: list[Any], value: float) -> Any:
+    def apply(self, name: str, operands: list[Any], value: Any) -> Any:
         found = super().apply(name, operands, value)
         return finite(found) if name in ("div", "inv", "constpow", "pow") else found
+
+
+_PLAIN_BALLS = _Checked(_ball, _BALLS)
+
+
+class RootEntry(NamedTuple):
+    """An entry of the root that a call asks for: malta/linear/implicit.py."""
+
+    function: ca.Function
+    place: int  # among the entries
+
+    def at_symbols(self, p: Sequence[Any]) -> Any:
+        """Its expression at expressions of p."""
+        return call(self.function, ca.vertcat(*p))[self.place]
+
+    def enclosure(self, p: Sequence[Any], *, is_one: bool = True) -> Any:
+        """Its values over complex balls of p: `ImplicitRoot.enclose`. Raises NotAnalytic where they are not known."""
+        found = _enclosed_root(self.function).enclose(p, is_one=is_one)
+        if found is None:
+            raise NotAnalytic("a root of equations that may end or divide")
+        return found[self.place]
+
+
+_ROOTS: dict[str, ImplicitRoot] = {}  # by name, in which its equations are counted
+MAX_KEPT_ROOTS = 64
+
+
+def _enclosed_root(function: ca.Function) -> ImplicitRoot:
+    if function.name() not in _ROOTS:
+        equations, nominal, near = root_equations(function)
+        model = program(equations).only((0, 1, 2))
+
+        def run(p: Sequence[Any], r: Sequence[Any]) -> Slopes | None:
+            try:
+                entries = model.run([*p, *r], _PLAIN_BALLS)
+            except NotAnalytic:
+                return None
+            F, F_r, F_p = (acb_mat(*shape) for shape in model.shapes[:3])
+            for matrix, own in zip((F, F_r, F_p), entries, strict=False):
+                for i, j, x in own:
+                    matrix[i, j] = x
+            return F, F_r, F_p
+
+        if len(_ROOTS) >= MAX_KEPT_ROOTS:
+            _ROOTS.clear()
+        _ROOTS[function.name()] = ImplicitRoot(run, partial(root_value, function), nominal, near)
+    return _ROOTS[function.name()]
 
 
 def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
@@ -273,8 +331,12 @@ def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[.
     return {name: wrap(function) for name, function in functions.items()}
 
 
-POINTS = _Checked(lambda x: arb(exact(x)), _at_points(_BALLS))
-BALLS = _Checked(_ball, _BALLS)
+def _real_root(entry: RootEntry, p: Sequence[Any]) -> Any:
+    return entry.enclosure([acb(x) for x in p]).real
+
+
+POINTS = _Checked(lambda x: arb(exact(x)), {**_at_points(_BALLS), "root": _real_root})
+BALLS = _Checked(_ball, {**_BALLS, "root": RootEntry.enclosure})
 
 
 def program(function: ca.Function) -> MatrixProgram:
@@ -289,7 +351,7 @@ def program(function: ca.Function) -> MatrixProgram:
             "uncertain", function.name(), "calls of functions that cannot be written out", "plain expressions"
         ) from error
     made: dict[int, int] = {}  # work cell of CasADi -> our step
-    steps: list[tuple[str, int, tuple[int, ...], float]] = []
+    steps: list[Step] = []
     outputs: dict[tuple[int, int], int] = {}
     arity = dict.fromkeys(("assign", "neg", "sq", "twice", "inv", "constpow"), 1)
     for k in range(flat.n_instructions()):
@@ -306,6 +368,13 @@ def program(function: ca.Function) -> MatrixProgram:
             exponent = steps[made[source[1]]] if len(source) > 1 else None
             value = exponent[3] if exponent is not None else flat.instruction_constant(k)
             steps.append((name, 0, (made[source[0]],), value))
+        elif name == "call":
+            operands = [made[i] for i in source if i >= 0]  # cells that the results may take
+            for index, cell in enumerate(target):
+                if cell >= 0:
+                    steps.append(_call(flat, operands, index, steps))
+                    made[cell] = len(steps) - 1
+            continue
         else:
             steps.append(_step(name, [made[i] for i in source[: arity.get(name, len(source))]], steps))
         made[target[0]] = len(steps) - 1
@@ -324,9 +393,19 @@ def program(function: ca.Function) -> MatrixProgram:
     return MatrixProgram(tuple(steps), tuple(entries), shapes, flat.size1_in(0))
 
 
-def _step(
-    name: str, operands: list[int], steps: list[tuple[str, int, tuple[int, ...], float]]
-) -> tuple[str, int, tuple[int, ...], float]:
+def _call(flat: ca.Function, operands: list[int], index: int, steps: list[Step]) -> Step:
+    """An entry of a root, whose function the constant behind its parameters names; else a call without enclosure."""
+    for place, k in enumerate(operands):
+        value = steps[k][3] if steps[k][0] == "const" else -1.0
+        name = f"{PREFIX}{value:.0f}"
+        if value == round(value) and flat.has_function(name):
+            function = flat.get_function(name)
+            if function.numel_in(0) == place and index < function.numel_out(0):
+                return ("root", 0, tuple(operands[:place]), RootEntry(function, index))
+    return ("call", 0, tuple(operands), 0.0)
+
+
+def _step(name: str, operands: list[int], steps: list[Step]) -> Step:
     if name == "pow" and steps[operands[1]][0] == "const":
         return ("constpow", 0, (operands[0],), steps[operands[1]][3])
     return (name, 0, tuple(operands), 0.0)

@@ -9,14 +9,17 @@ A proof needs them exactly: a model at another rest is a model of another machin
   * where the equations are affine in what is unknown, as those of a commutation with other parameters,
   * where they can be solved one by one, each of degree 2 at most in an unknown of its own, squares of roots resolved.
 
-Elsewhere they come from a fixed number of Newton steps, which is good enough to search for unstable machines and not
-for a proof: an operation that no enclosure knows keeps every proof away from such a model.
+  * elsewhere as the root of as many equations as there are unknowns, which interval Newton encloses (implicit.py).
+
+Where equations are fewer, or have an operation without enclosure, a fixed number of Newton steps is good enough to
+search for unstable machines and not for a proof: an operation that no enclosure knows keeps every proof away.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -25,8 +28,9 @@ from flint.utils.flint_exceptions import DomainError
 
 from malta.arrays import FloatArray
 from malta.linear import rational
-from malta.linear.branches import SYMBOLS
-from malta.linear.expressions import NotAnalytic, program
+from malta.linear.branches import SYMBOLS, resolve_branches
+from malta.linear.expressions import MatrixProgram, NotAnalytic, program
+from malta.linear.implicit import call, implicit_function
 from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
 from malta.model.equilibrium import rates_at_rest
 from malta.model.parameters import symbolic_names
@@ -194,15 +198,53 @@ def solve_rows(rows: Any, unknowns: Unknowns, guesses: Sequence[Any]) -> Formula
     for guess in guesses:
         if _is_near(guess, unknowns) and _vanishes(ca.substitute([rows], [r], [guess])[0], p):
             return Formula(guess)
-    try:
+    found, why = None, "several commands balance the machine"
+    with suppress(TooLarge, NotAnalytic, ZeroDivisionError):
         found = _exact(rows, unknowns)
-    except (TooLarge, NotAnalytic, ZeroDivisionError):
-        found = None
     if found is None and is_affine(rows, r) and rows.numel() <= MAX_MINORS:
         found = Formula(_by_minors(rows, r))
     if found is not None and _is_near(found.values, unknowns):
         return found
-    return Formula(_newton(rows, unknowns), why="no formula of the parameters")
+    if rows.numel() == r.numel():
+        try:
+            return _implicit(rows, unknowns)
+        except NotAnalytic as error:
+            why = f"the equations of rest have {error}, which has no enclosure"
+    return Formula(_newton(rows, unknowns), why=why)
+
+
+def _implicit(rows: Any, unknowns: Unknowns) -> Formula:
+    """The root of as many equations as there are unknowns; rest ends where it does, or divides.
+
+    What is a root itself in the equations is a parameter of theirs. Raises NotAnalytic for operations without
+    enclosure.
+    """
+    r, near, p, nominal = unknowns
+    model, count = program(ca.Function("rows", [ca.vertcat(p, r)], [ca.densify(rows)])), 0
+    if model.foreign:
+        model, count = resolve_branches(model, [*nominal, *near])
+    if model.foreign:
+        raise NotAnalytic(model.foreign[0])
+    inner = {k: n for n, k in enumerate(k for k, (name, *_) in enumerate(model.steps) if name == "root")}
+    steps = tuple(
+        ("input", model.inputs + inner[k], (), 0.0) if k in inner else step
+        for k, step in enumerate(model.steps)
+    )
+    outer, symbols = ca.vertsplit(ca.vertcat(p, r)), ca.SX.sym("a", len(inner))
+    cells = MatrixProgram(steps, (), (), model.inputs + len(inner)).cells(
+        [*outer, *ca.vertsplit(symbols)], SYMBOLS
+    )
+    left = ca.SX.zeros(r.numel())
+    for i, _, k in model.entries[0]:
+        left[i] = cells[k]
+    before = model.cells(outer, SYMBOLS)
+    own, at = ca.vertcat(p, symbols), ca.vertcat(p, *(before[k] for k in inner))
+    acts = [k for k, yes in enumerate(ca.which_depends(left, own, 1, False)) if yes]
+    values = np.array(ca.Function("at", [p], [ca.densify(at)])(nominal)).ravel()
+    found = call(implicit_function(left, own[acts], r, values[acts], near), at[acts])
+    branches = [ca.substitute([before[k]], [r], [found])[0] for i, _, k in model.entries[-1] if i < count]
+    exists = ca.exp(ca.atan(found[0]))  # above zero wherever there is a root
+    return Formula(found, (Condition(exists), *(Condition(one) for one in branches)))
 
 
 def is_affine(made: Any, v: Any) -> bool:

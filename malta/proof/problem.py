@@ -367,6 +367,10 @@ class CoefficientPolynomial:
         return self.program.foreign
 
     @property
+    def implicit(self) -> bool:
+        return self.program.implicit
+
+    @property
     def price(self) -> float:
         return EXACT_STEP * len(self.program.steps)
 

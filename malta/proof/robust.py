@@ -32,7 +32,7 @@ from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, product
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
-from malta.proof.box import Box, box_of, within_branches
+from malta.proof.box import NO_ONE_REST, Box, box_of, within_branches
 from malta.proof.branch_cases import margin_by_cases
 from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
@@ -291,15 +291,25 @@ def robust_margin(
     over = by_name("robust_margin", "over", {} if over is None else over, '{"k": (1, 2)}')
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
-    box = within_branches(box, named)
+    problem, whole = problem_of(named, law), box
+    box = within_branches(whole, named, partial(_loss_by_poles, problem))
     cases = branch_cases(named.matrices) if program(named.matrices).foreign else []
-    problem = problem_of(named, law)
     if cases:
         lost = _lost_by_poles(problem, box, "")
         found = margin_by_cases(named, cases, box, lost, partial(_margin_of_case, law, effort))
         found = _name_idle(found, problem, box)
     else:
         found = margin_of(problem, box, effort)
+    if box.ends == NO_ONE_REST and math.isinf(found.upper):
+        lost = _lost_by_poles(problem, whole, "")
+        found = replace(
+            lost,
+            lower=found.lower,
+            certificate=found.certificate,
+            reason=found.reason or NO_ONE_REST,
+            seconds=found.seconds,
+            work=found.work,
+        )
     return replace(found, reason=named.reason(found.reason))
 
 
@@ -347,8 +357,8 @@ def common_margin(
             raise InputError("margin", "places", "loops of different parameters or clocks", "alike ones")
     outside = {} if over is None else over
     box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="margin")
-    for system, _ in loops:
-        box = within_branches(box, system)
+    for system, law in loops:
+        box = within_branches(box, system, partial(_loss_by_poles, problem_of(system, law)))
     return margin_of(OfSeveral(tuple(problem_of(*loop) for loop in loops)), box, effort)
 
 
@@ -379,8 +389,9 @@ def margin_at(
     nominal = system.nominal.copy()
     for name, value in at.items():
         nominal[system.names.index(name)] = value
-    box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system)
     problem = problem_of(system, compensator)
+    box = box_of(system.names, nominal, system.limits, ranges, {})
+    box = within_branches(box, system, partial(_loss_by_poles, problem))
     if wider is not None and wider.lower and wider.witness is not None:
         reach = wider.lower * (1 + (tolerance or TOLERANCE))
         witness = np.array([at[name] if name in at else wider.witness[name] for name in box.names])
@@ -528,6 +539,11 @@ def _ask(
     question = Question(problem, box, tolerance, fixed, work, effort.limits.cells, patient, standing)
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         return search(question)
+
+
+def _loss_by_poles(problem: Problem, box: Box) -> float:
+    """The first loss along the diagonals of a box, or where it ends."""
+    return min(first_loss(problem, box, box.limit)[0], box.limit)
 
 
 def _lost_by_poles(problem: Problem, box: Box, why: str) -> Margin:

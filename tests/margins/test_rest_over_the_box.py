@@ -245,6 +245,41 @@ def test_what_is_proven_of_an_axis_is_its_loop() -> None:
     assert sum(x > 0 for x in proven) >= 4
 
 
+def saturating(par: Any) -> Plant:
+    """The ball of the examples, whose iron saturates: its current at rest solves an equation that has no formula."""
+    ball = BALL.variant(par)
+
+    def pull(x: Any, i: Any) -> Any:
+        own = 2 * ca.tanh(i / 2)
+        up, down = (par.I_0 + own) / (par.s - x[0]), (par.I_0 - own) / (par.s + x[0])
+        return par.C * (up**2 - down**2)
+
+    return replace(ball, variant=saturating, actuator=replace(ball.actuator, forces=pull))
+
+
+BALL = malta.read_design("examples/ball/design/ball.toml").plant
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        {"m": 0.1},
+        pytest.param({"C": 0.1}, marks=pytest.mark.slow),
+        pytest.param({"m": 0.05, "C": 0.05}, marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
+)
+def test_a_rest_that_is_no_formula_is_proven_as_it_is(box: dict[str, float]) -> None:
+    """300 g before iron that saturates: what is proven is the loop at each own balance, and lost beyond a witness."""
+    own = saturating(replace(BALL.parameters, m=0.3))
+    weights = malta.synthesis.weights([1.0, 1e-3], [1.0], [1e-2], [4e-12])
+    law = malta.lqg(malta.linearize(own, own.at()), weights, TS)
+    assert check_box((own, law, box, {}), 20, np.random.default_rng(4)) > 0.3
+    if len(box) == 1:
+        found = malta.robust_margin(malta.loop(own, law), box)
+        assert (found.lower or 0.0) > 0.998 * found.upper
+
+
 @pytest.mark.slow
 def test_what_is_proven_of_any_machine_is_its_loop() -> None:
     """16 machines with springs, drags and weights in their loads, laws of another mass, 200 points of each box."""

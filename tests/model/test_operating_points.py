@@ -13,7 +13,9 @@ from magnets import BENCH, MACHINES, bench, two_coils
 
 import malta
 from malta.app.linear_run import linear_run
+from malta.linear.expressions import program
 from malta.loops.parametric_plants import of_plant
+from malta.loops.rest import Unknowns, solve_rows
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.model.equilibrium import with_command
 from malta.model.plant import OperatingPoint
@@ -180,7 +182,7 @@ PROVEN = {  # a machine, what its controller believes otherwise, and whether its
     "inverse": (True, True),
     "middle": (True, True),
     "slope": (True, True),
-    "three coils": (False, False),
+    "three coils": (True, True),
 }
 
 
@@ -221,21 +223,46 @@ def test_the_ball_in_parameters_off_its_middle(q: float) -> None:
     np.testing.assert_allclose(B[0], model.B, rtol=1e-12)
 
 
-def test_nothing_is_proven_at_a_command_that_is_no_formula() -> None:
-    """The witness is searched with the converged command; the bound is refused, with its reason, by every prover."""
+@pytest.mark.slow
+def test_a_command_that_is_no_formula_is_proven_as_a_root() -> None:
+    """Three coils under a weight: the margin is where the poles of the model at its own balance are lost."""
     make, par, at = MACHINES["three coils"]
     plant = make(par)
     system = of_plant(plant, ("m", "C"), at=at, believed=plant)
-    A, B, C = (M[0] for M in system.at(system.nominal))
+    assert (system.approximate, program(system.matrices).implicit) == ("", True)
+    A, B, _ = (M[0] for M in system.at(system.nominal))
     inverse, w, fast = np.linalg.inv(B[2:]), 60.0, 2e3  # PD with a fast filter
     K, D, one = inverse @ (A[2:, :2] + w**2 * np.eye(2)), 1.4 * w * inverse, np.eye(2)
     law = malta.proof.Compensator(-fast * one, fast * one, fast * D, -K - fast * D)
-    for refused in (system, replace(system, approximate="")):  # and by the operation that no enclosure knows
-        found = malta.robust_margin(refused, law, {"m": 0.2, "C": 0.2}, time=1.0)
-        assert found.lower is None
-        assert found.upper == pytest.approx(4.66, abs=0.3)
-    assert "no formula" in malta.robust_margin(system, law, {"m": 0.2, "C": 0.2}).reason
-    assert C.shape == (2, 4)
+
+    def worst(t: float) -> float:
+        other = make(replace(par, C=(1 + 0.2 * t) * par.C))
+        model = malta.linearize(other, malta.trim(other, **at), plant)
+        closed = np.block([[model.A + model.B @ law.D @ model.C, model.B @ law.C], [law.B @ model.C, law.A]])
+        return float(np.linalg.eigvals(closed).real.max())
+
+    found = malta.robust_margin(system, law, {"C": 0.2})
+    lower = found.lower or 0.0
+    assert worst(0.999 * lower) < 0
+    if np.isfinite(found.upper):
+        assert worst(1.001 * found.upper) > 0
+        assert lower > 0.998 * found.upper
+    else:
+        assert "nothing holds it at rest within the limit" in found.searched
+
+
+def test_what_no_root_is_proven_of_is_said() -> None:
+    """Fewer equations than commands, and an operation without enclosure: searched in floating point, not proven."""
+    p, r = ca.SX.sym("p"), ca.SX.sym("r", 2)
+    unknowns = Unknowns(r, np.array([0.5, 0.75]), p, np.array([1.0]))
+    wide = solve_rows(r[0] ** 2 + r[1] - p, unknowns, [])
+    assert wide.why == "several commands balance the machine"
+    both = solve_rows(ca.vertcat(r[0] + ca.floor(r[0]) * r[1] - p / 2, r[1] ** 3 - 0.75**3 * p), unknowns, [])
+    assert both.why == "the equations of rest have floor, which has no enclosure"
+    for found in (wide, both):
+        assert program(ca.Function("r", [p], [found.values])).foreign
+        near = np.array(ca.Function("r", [p], [found.values])(1.0)).ravel()
+        np.testing.assert_allclose(near, unknowns.near, rtol=1e-12)
 
 
 def test_the_check_says_where_currents_are_no_inverse() -> None:

@@ -140,6 +140,10 @@ class Characteristic:
         return self.loop.program.foreign
 
     @property
+    def implicit(self) -> bool:
+        return self.loop.program.implicit
+
+    @property
     def discrete(self) -> bool:
         return self.loop.law.sample_time is not None
 

@@ -32,6 +32,7 @@ MAX_DEGREE = 16  # degree of an interpolation along one parameter
 LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
 RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 25, 32, 40))
 FIRST_RADIUS = RADII.index(2.0**12)  # where the search of discs begins
+FIRST_IMPLICIT_RADIUS = RADII.index(2.0**1.5)  # of roots of equations, which are not enclosed far from a box
 BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
 DISC = 5.0  # times the work of a place, that of a disc
@@ -46,6 +47,8 @@ class Polynomial(Protocol):
     def exact(self) -> bool: ...
     @property
     def foreign(self) -> tuple[str, ...]: ...
+    @property
+    def implicit(self) -> bool: ...
     @property
     def inverted(self) -> tuple[bool, ...]: ...
     @property
@@ -229,7 +232,8 @@ def discs_of(
     """
     found: list[Disc] = []
     refused = NotAnalytic("no disc about its range")
-    for radii in (RADII[FIRST_RADIUS:], RADII[:FIRST_RADIUS][::-1]):
+    first = FIRST_IMPLICIT_RADIUS if f.implicit else FIRST_RADIUS
+    for radii in (RADII[first:], RADII[:first][::-1]):
         least = min((_wanted_degree(disc, TAILS[0]) for disc in found), default=math.inf)
         if len(found) > 1 and least < _wanted_degree(found[0], TAILS[0]):
             break  # larger discs are the better ones
@@ -239,7 +243,7 @@ def discs_of(
                 disc = _disc(f, i, low, high, size, radius)
             except NotAnalytic as error:
                 refused = error
-                if radius >= RADII[FIRST_RADIUS]:  # nor on larger discs
+                if radius >= RADII[first]:  # nor on larger discs
                     break
                 continue
             found.append(disc)
