@@ -1,99 +1,20 @@
-"""Reading files with a sentence for every refusal; writing them so that nothing is lost or half-written."""
+"""Finding and reading files, with a sentence for every refusal."""
 
 from __future__ import annotations
 
 import atexit
-import glob
-import math
-import os
 import re
 import shutil
-import signal
 import stat
 import tempfile
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from types import FrameType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from malta.errors import InputError
-
-# Ctrl-C: noted where libraries may drop the KeyboardInterrupt, and put off where files are renamed into place.
-
-
-Handler = Callable[[int, FrameType | None], Any]
-
-
-@contextmanager
-def watch_interrupts() -> Iterator[list[float]]:
-    """Note when Ctrl-C was pressed (s, monotonic), and let it raise as usual; nothing is noted outside the main thread.
-
-    Libraries may drop the KeyboardInterrupt: whoever watches can raise it again.
-    """
-    pressed: list[float] = []
-    handle = _usual_handler()
-    if handle is None:
-        yield pressed
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        pressed.append(time.monotonic())
-        handle(number, frame)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, handle)
-
-
-def press_again() -> None:
-    """Press Ctrl-C for the main thread, also where it waits."""
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        signal.raise_signal(signal.SIGINT)
-
-
-def is_interrupt(error: BaseException) -> bool:
-    """Whether an error is Ctrl-C: KeyboardInterrupt, or what C code makes of it, such as SystemError with that cause.
-
-    Example: `is_interrupt(KeyboardInterrupt())` is True.
-    """
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return isinstance(error, KeyboardInterrupt)
-
-
-@contextmanager
-def put_off_interrupts() -> Iterator[None]:
-    """Put Ctrl-C off to the end of a block."""
-    handle = _usual_handler()
-    if handle is None:
-        yield
-        return
-    frames: list[FrameType | None] = []
-    signal.signal(signal.SIGINT, lambda _, frame: frames.append(frame))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handle)
-    if frames:
-        handle(signal.SIGINT, frames[-1])
-
-
-def _usual_handler() -> Handler | None:
-    """What Ctrl-C does now; None outside the main thread, and where it is ignored."""
-    handler = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(handler):
-        return None
-    return handler
-
 
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
@@ -180,118 +101,6 @@ def file_exists(path: Path) -> bool:
         return False
 
 
-def replace_files(contents: Mapping[Path, bytes]) -> None:
-    """Write files, all or none: each is completed beside its target before any is renamed into place.
-
-    Content and names are on the disk when the function returns, so that no power failure leaves a file half-written.
-    Folders are made as needed. Raises InputError when one cannot be written to; the old files then stand.
-    """
-    staged: list[tuple[Path, Path]] = []
-    try:
-        for path, data in contents.items():
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                remove_leftovers(path.parent, glob.escape(path.name[:50]))
-                if path.exists() and not path.is_file():
-                    raise IsADirectoryError(0, _obstacle(path), str(path))
-                temporary = temporary_name(path)
-                staged.append((temporary, path))
-                with temporary.open("xb") as file:
-                    file.write(data)
-                    file.flush()
-                    os.fsync(file.fileno())
-            except (OSError, ValueError) as error:
-                raise _refusal(path, error) from error
-        before = {path: path.read_bytes() if path.exists() else None for _, path in staged}
-        with put_off_interrupts():
-            _rename(staged, before)
-        for folder in {path.parent for _, path in staged}:
-            _sync_folder(folder)
-    finally:
-        for temporary, _ in staged:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
-
-
-def _rename(staged: list[tuple[Path, Path]], before: Mapping[Path, bytes | None]) -> None:
-    """Rename files into place, all or none. Raises InputError; the old files stand then."""
-    replaced: list[Path] = []
-    for temporary, path in staged:
-        try:
-            temporary.replace(path)
-        except OSError as error:
-            for other in replaced:
-                old = before[other]
-                other.unlink() if old is None else other.write_bytes(old)
-            raise _refusal(path, error) from error
-        replaced.append(path)
-    for noted in _notes:
-        noted.extend(replaced)
-
-
-_notes: list[list[Path]] = []  # of `noting_files`
-
-
-@contextmanager
-def noting_files() -> Iterator[list[Path]]:
-    """Note the files that are written; yields the list that grows."""
-    written: list[Path] = []
-    _notes.append(written)
-    try:
-        yield written
-    finally:
-        _notes.pop()
-
-
-def json_text(content: Any) -> str:
-    """A JSON document; numbers that are not finite become null."""
-    import json  # here, because few commands write one
-
-    def finite(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: finite(entry) for key, entry in value.items()}
-        if isinstance(value, list | tuple):
-            return [finite(entry) for entry in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(finite(content), indent=1, allow_nan=False)
-
-
-def temporary_name(path: Path) -> Path:
-    """A hidden name beside a file that no other process takes, on this computer or on one that shares the volume."""
-    return path.with_name(f".{path.name[:50]}.{writer()}.{os.urandom(4).hex()}")
-
-
-def remove_leftovers(folder: Path, names: str) -> None:
-    """Remove temporary files that killed processes of this computer have left. names : pattern of the files' names"""
-    host = writer().rpartition(".")[0]
-    for leftover in folder.glob(f".{names}.{host}.*.*"):
-        process = leftover.name.split(".")[-2]
-        if process.isdigit() and not _is_alive(int(process)):
-            with suppress(OSError):
-                leftover.unlink()
-
-
-def _is_alive(process: int) -> bool:
-    """Whether a process runs on this computer; True where that cannot be asked."""
-    if os.name != "posix":
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # of another user
-        return True
-    return True
-
-
-def writer() -> str:
-    """Computer and process, as they stand in temporary names."""
-    import socket  # here, because `malta --help` must not wait for it
-
-    return f"{re.sub('[^A-Za-z0-9-]', '_', socket.gethostname())[:40]}.{os.getpid()}"
-
-
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
     """A folder for a block of files that are not kept. Raises InputError where they cannot be written."""
@@ -301,21 +110,7 @@ def scratch_folder() -> Iterator[Path]:
         with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)
     except OSError as error:
-        raise _refusal(Path(tempfile.gettempdir()), error) from error
-
-
-def _obstacle(path: Path) -> str:
-    return "a folder of that name" if path.is_dir() else "a pipe or a device of that name"
-
-
-def _sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk, on file systems that can."""
-    with suppress(OSError):
-        opened = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
+        raise unwritable(Path(tempfile.gettempdir()), error) from error
 
 
 def read_file(
@@ -367,7 +162,8 @@ def _most_like(path: Path) -> Path | None:
     return None
 
 
-def _refusal(path: Path, error: OSError | ValueError) -> InputError:
+def unwritable(path: Path, error: OSError | ValueError) -> InputError:
+    """The refusal of a place that a file cannot be written to."""
     reason = getattr(error, "strerror", None) or str(error)
     blamed = getattr(error, "filename", None)
     if blamed and Path(blamed) in path.parents:

@@ -42,6 +42,7 @@ weber = volt * second = Wb
 tesla = weber / meter ** 2 = T
 percent = 0.01
 """
+FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
 
 
 @cache

@@ -24,7 +24,6 @@ from rich.console import Console
 
 import malta
 from malta.cli import main as cli
-from malta.files import replace_files
 from malta.firmware import cost
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.machines.tubular import plant as tubular
@@ -32,6 +31,7 @@ from malta.model.data import read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
 from malta.proof.problem import OfLoop, OfSeveral, Problem
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport

@@ -25,10 +25,10 @@ from typer.testing import CliRunner
 import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.main import app as program
-from malta.files import json_text
 from malta.schemas.files import change_nodes, without_null
 from malta.synthesis.design_tables import specification_record
 from malta.synthesis.requirements import GENERIC_REQUIREMENTS, requirements_for
+from malta.writing import json_text
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx

@@ -21,7 +21,7 @@ import tomlkit
 
 from malta.app.fields import MACHINE, PageField, check_value, fields_of
 from malta.errors import CheckError, InputError
-from malta.files import file_exists, replace_files
+from malta.files import file_exists
 from malta.gains import SUFFIXES
 from malta.model.fingerprint import fingerprint as record_fingerprint
 from malta.model.parameters import check_range
@@ -31,6 +31,7 @@ from malta.synthesis.design_file import resolve_published, spec_of
 from malta.synthesis.spec import Spec, integral_signals
 from malta.tables import load_toml
 from malta.units import to_si
+from malta.writing import replace_files
 
 Value = float | int | bool | str
 

@@ -41,12 +41,13 @@ from malta.campaigns.run import replay_machine
 from malta.campaigns.store import seal, simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.files import file_exists, json_text, read_file, replace_files
+from malta.files import file_exists, read_file
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.simulate import EngineOf
 from malta.tables import read_npz
+from malta.writing import json_text, replace_files
 
 # Subset simulation: small probabilities as a product of larger ones, each by Markov chains on the runs before.
 #

@@ -36,8 +36,9 @@ from malta.campaigns.store import (
 )
 from malta.campaigns.summary import NO_BOUNDS, RunLimits, Summary, join, summary_of
 from malta.errors import InputError
-from malta.files import file_exists, replace_files, watch_interrupts
+from malta.files import file_exists
 from malta.firmware.flight import engine_of_c
+from malta.interrupts import watch_interrupts
 from malta.simulation.engine import compiled
 from malta.simulation.engine.batch import record_run, replay_run
 from malta.simulation.engine.engines import EngineChoice
@@ -46,6 +47,7 @@ from malta.simulation.experiments.catalogue import main_job, settling_option, si
 from malta.simulation.simulate import EngineOf
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
+from malta.writing import replace_files
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
 LARGE_BLOCK = 16_384  # of a large campaign: seconds of work, 5 MB in a file, some 50 MB while it is simulated

@@ -36,7 +36,7 @@ from malta.campaigns.plan import (
     varied_names,
 )
 from malta.errors import InputError
-from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
+from malta.files import file_exists, read_file
 from malta.firmware.flight import engine_of_c
 from malta.model.fingerprint import fingerprint
 from malta.simulation.engine.batch import is_compiled, simulate_many
@@ -46,6 +46,7 @@ from malta.simulation.experiments import Progress
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
 from malta.tables import read_npz
+from malta.writing import remove_leftovers, replace_files, writer
 
 # A block: some consecutive runs of a plan, simulated together.
 

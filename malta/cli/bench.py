@@ -28,7 +28,8 @@ from malta.cli.options import (
 )
 from malta.cli.output import make_console, print_document, print_note, print_text, print_written, progress_on
 from malta.errors import CheckError, InputError
-from malta.files import PICTURES, replace_files
+from malta.files import PICTURES
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.identification.commission import Check, Commissioning

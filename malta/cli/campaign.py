@@ -43,7 +43,7 @@ from malta.cli.output import (
     progress_bar,
 )
 from malta.errors import InputError
-from malta.files import json_text, replace_files
+from malta.writing import json_text, replace_files
 
 if TYPE_CHECKING:
     from malta.campaigns.limits import Limit

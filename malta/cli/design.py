@@ -29,7 +29,8 @@ from malta.cli.output import (
     progress_on,
 )
 from malta.errors import CheckError, InputError
-from malta.files import file_exists, replace_files, shipped_path
+from malta.files import file_exists, shipped_path
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.cli.documents.campaigns import DesignPart

@@ -267,9 +267,9 @@ def schema(
     """
     from malta import schemas
     from malta.cli.documents.published import ALL_SCHEMAS, schema_of
-    from malta.files import json_text
     from malta.model.data import read
     from malta.model.plants import plant_of
+    from malta.writing import json_text
 
     if name is None:
         print("\n".join(ALL_SCHEMAS))

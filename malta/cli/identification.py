@@ -32,7 +32,8 @@ from malta.cli.output import (
     progress_on,
 )
 from malta.errors import CheckError, InputError
-from malta.files import PICTURES, replace_files
+from malta.files import PICTURES
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

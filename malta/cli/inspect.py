@@ -11,7 +11,8 @@ import typer
 from malta.cli.options import DESIGNS, AsJson, MachineFile, is_machine_data, read_controller
 from malta.cli.output import make_console, print_document, print_line, print_note
 from malta.errors import InputError, shorten
-from malta.files import locate, replace_files
+from malta.files import locate
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

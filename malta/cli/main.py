@@ -30,7 +30,9 @@ from malta.cli.report import compare, plot, report
 from malta.cli.simulate import simulate
 from malta.cli.verify import check, verify
 from malta.errors import CheckError, InputError, shorten
-from malta.files import is_interrupt, noting_files, version
+from malta.files import version
+from malta.interrupts import is_interrupt
+from malta.writing import noting_files
 
 # The class of all commands: help in panels, and the options of the version before, which say what replaces them.
 

@@ -18,7 +18,8 @@ import typer
 
 from malta.bound import at_least, at_most
 from malta.errors import CheckError, InputError, shorten
-from malta.files import is_interrupt, json_text, press_again, watch_interrupts
+from malta.interrupts import is_interrupt, press_again, watch_interrupts
+from malta.writing import json_text
 
 if TYPE_CHECKING:
     from rich.console import Console

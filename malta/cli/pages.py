@@ -22,7 +22,9 @@ from malta.cli.options import (
 )
 from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
 from malta.errors import InputError
-from malta.files import locate, read_file, replace_files, watch_interrupts
+from malta.files import locate, read_file
+from malta.interrupts import watch_interrupts
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.app.session import Session

@@ -34,7 +34,8 @@ from malta.cli.output import (
     progress_bar,
 )
 from malta.errors import InputError
-from malta.files import locate, replace_files, require_suffix
+from malta.files import locate, require_suffix
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -278,7 +278,7 @@ def _replay(
 def _save(simulation: SimulatedScenario, folder: Path, published: Mapping[str, Any] | None) -> list[Path]:
     """Write the time series of every run, and the figure."""
     from malta import report
-    from malta.simulation.trajectory import save as save_series
+    from malta.simulation.trajectory_file import save as save_series
 
     cases, stem = simulation.experiment.cases, simulation.stem
     stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]

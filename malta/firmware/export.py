@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.arguments import positive
 from malta.errors import InputError
-from malta.files import file_exists, locate, replace_files
+from malta.files import file_exists, locate
 from malta.firmware.calibration import (
     FNV_FACTOR,
     FNV_START,
@@ -61,6 +61,7 @@ from malta.model.parameters import box_words
 from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller
+from malta.writing import replace_files
 
 # ASAP2 description (1.7) of a tunable controller: its parameters as CHARACTERISTIC, what it commands as MEASUREMENT.
 #

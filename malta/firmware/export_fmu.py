@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from malta.files import locate, replace_files
+from malta.files import locate
 from malta.firmware.export import Until, target_of
 from malta.firmware.fmu import Part, build_fmu
 from malta.gains.file import content_of
 from malta.gains.stable import read_stable
+from malta.writing import replace_files
 
 
 def export_fmu(

@@ -21,8 +21,9 @@ from malta.firmware.blocks import Staged, staged_function
 from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.program import as_written
 from malta.firmware.signals import CField, Target, reading_ranges
-from malta.model.equations import note, recorded_equations, recorded_look_ups
+from malta.model.equations import note, recorded_equations
 from malta.model.places import place_states
+from malta.model.table_look_ups import recorded_look_ups
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import LoopPlan, Symbols, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference

@@ -14,10 +14,10 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.firmware.program import TYPES, Precision
-from malta.model.equations import LookUp, recorded_look_ups
 from malta.model.places import place_states
 from malta.model.plant import Plant, Signal
 from malta.model.plants import plant_of
+from malta.model.table_look_ups import LookUp, recorded_look_ups
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 

@@ -28,8 +28,9 @@ from malta.firmware.period_functions import (
 )
 from malta.firmware.program import Program, evaluate
 from malta.firmware.signals import CField, Target
-from malta.model.equations import interpolate, note, recorded_equations
+from malta.model.equations import note, recorded_equations
 from malta.model.plant import Plant
+from malta.model.table_look_ups import interpolate
 from malta.simulation import references
 from malta.simulation.period import state_reference
 from malta.synthesis.law import command_forces, freeze_moving

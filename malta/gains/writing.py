@@ -14,7 +14,7 @@ import numpy as np
 
 from malta.arguments import is_number
 from malta.errors import CheckError, InputError
-from malta.files import replace_files, require_plain_name, version
+from malta.files import require_plain_name, version
 from malta.gains.contents import LINEAR_MACHINE_NAME
 from malta.gains.encodings import SUFFIXES as SUFFIXES, content_sha256, encode
 from malta.gains.file import SCHEMA, content_of
@@ -23,6 +23,7 @@ from malta.model.machines import build_plant
 from malta.model.parameters import units_of, values_of
 from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     pass

@@ -20,7 +20,7 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.files import file_exists, json_text, read_file, replace_files
+from malta.files import file_exists, read_file
 from malta.gains.file import content_of
 from malta.identification.calibration import Interval95, at_rest
 from malta.identification.excite import cut_loop, output_bands
@@ -40,6 +40,7 @@ from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
+from malta.writing import json_text, replace_files
 
 JOURNAL = "journal.json"
 MAX_JOURNAL_BYTES = 10_000_000  # bytes of a journal

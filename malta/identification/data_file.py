@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.files import replace_files, require_suffix
+from malta.files import require_suffix
 from malta.model.data import MachineFile, read
 from malta.model.machines import file_of
 from malta.model.parameters import twins_of, units_of, values_of
 from malta.tables import load_toml, validate
 from malta.units import to_si
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.identification.identify import Identified

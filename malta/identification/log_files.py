@@ -19,15 +19,16 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.files import read_file, read_packaged, replace_files, require_suffix
+from malta.files import read_file, read_packaged, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
 from malta.model.plant import Signal
 from malta.simulation.engine.compiled import address_of, library
-from malta.simulation.engine.engines import SAMPLE_LOOP_FLAGS
+from malta.simulation.engine.sample_loops import SAMPLE_LOOP_FLAGS
 from malta.tables import read_npz
 from malta.units import is_unit_of, to_si
+from malta.writing import replace_files
 
 VERSION = 1
 MAX_LOG_BYTES = 2_000_000_000  # bytes of a log

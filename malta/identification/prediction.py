@@ -29,7 +29,7 @@ from malta.errors import CheckError
 from malta.identification.response import ResponseModel, axes_of, current_rate
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.simulation.engine.engines import Loop, loop_of
+from malta.simulation.engine.sample_loops import Loop, loop_of
 from malta.simulation.period import runge_kutta
 from malta.synthesis.riccati import dare
 

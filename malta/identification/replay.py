@@ -19,7 +19,7 @@ from malta.identification.spectra import MAX_PARAMETER_CHANGE, sentence_of
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
-from malta.simulation.engine.engines import Loop, loop_of
+from malta.simulation.engine.sample_loops import Loop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
 from malta.simulation.period import law_reference

@@ -17,11 +17,12 @@ from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
 from malta.loops.windings import CurrentLoops, left_out
 from malta.margins.travel import NO_EXTENT, NOT_BETWEEN_TEXT, Extent
-from malta.merits import ROOTS, Merit, figure, in_groups
+from malta.merit_lists import in_groups
+from malta.merits import ROOTS, Merit, figure
 from malta.model.parameters import box_words
-from malta.model.signal_groups import FINE_UNITS
 from malta.proof.margin import NOT_PROVEN, Margin
 from malta.synthesis.requirements import Figure, NoiseRms, Payload, Verdict, judge_figure, ratio_of
+from malta.units import FINE_UNITS
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray

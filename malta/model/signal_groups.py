@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from malta.model.parts import attribute_of
 from malta.model.plant import Plant, Signal
+from malta.units import FINE_UNITS
 
-FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
 KINDS: Mapping[str, str] = {"N": "force", "N m": "torque"}
 
 

@@ -33,7 +33,7 @@ from malta.checker.loop import (
     split,
 )
 from malta.errors import CheckError, InputError
-from malta.files import replace_files, version
+from malta.files import version
 from malta.linear.compensators import compensator_of
 from malta.linear.expressions import FIELD, MatrixProgram, exact, program as expressions_of
 from malta.linear.sampling import split_delay
@@ -41,6 +41,7 @@ from malta.proof.box import Box, below, box_of
 from malta.proof.exclusion import Growth, advance, start
 from malta.proof.groups import E, UncertainLoop, loop_of
 from malta.proof.polynomial.family import Family, binary
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

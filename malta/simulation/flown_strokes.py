@@ -10,7 +10,8 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.display import display
-from malta.merits import Merit, merit_field, reported_merits
+from malta.merit_lists import merit_field, reported_merits
+from malta.merits import Merit
 from malta.simulation.trajectory import Trajectory
 
 

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray, readonly
 from malta.display import Curves, Description, display, quantity
-from malta.files import replace_files
 from malta.merits import Merit
-from malta.model.plant import Plant, Signal
-from malta.model.signal_groups import FINE_UNITS
+from malta.model.plant import Plant
 from malta.simulation.divergence import free_outputs, rooms_in, rooms_of
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of
 from malta.synthesis.controller import Controller
+from malta.units import FINE_UNITS
 
 # How a simulation ended: completed, diverged, or at the first contact.
 
@@ -291,38 +288,3 @@ def label_rows(
         reference=given[kept, : len(plant.outputs)],
         **{name: rows[:, columns.get(name, none)] for name in SERIES},
     )
-
-
-def save(run: Trajectory, path: str | Path) -> Path:
-    """Write the time series as .npz.
-
-    The archive has t, verdict, and for every series an array and its columns as "name [unit]" in <series>_columns.
-    """
-    path, drive = Path(path), run.plant.actuator.windings
-    axes, phases = ((), run.plant.actuator.coils) if drive is None else (drive.axes, drive.phases)
-    columns = {
-        "reference": run.plant.outputs,
-        "p": run.plant.outputs,
-        "y": run.plant.outputs,
-        "x": run.plant.states,
-        "xi_hat": run.controller.states,
-        "v": run.plant.inputs,
-        "force": run.plant.inputs,
-        "saturated": run.plant.inputs,
-        "current": run.plant.actuator.coils,
-        "i": axes,
-        "u": tuple(Signal(s.name.replace("i_", "u_"), "V") for s in axes),
-        "link": (Signal("V_link", "V"),),
-        "i_phase": phases,
-        "duty": tuple(Signal(s.name.replace("i_", "d_"), "1") for s in phases),
-    }
-    arrays: dict[str, Any] = {"t": run.t, "verdict": np.array([run.verdict.name])}
-    for name, signals in columns.items():
-        if not getattr(run, name).shape[1]:
-            continue  # not simulated at this fidelity
-        arrays[name] = getattr(run, name)
-        arrays[f"{name}_columns"] = np.array([f"{s.name} [{s.unit}]" for s in signals])
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    replace_files({path: buffer.getvalue()})
-    return path

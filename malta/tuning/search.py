@@ -21,13 +21,14 @@ from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.files import file_exists, read_file, replace_files
+from malta.files import file_exists, read_file
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import base_of, requirements_for
 from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
+from malta.writing import replace_files
 
 Progress = Callable[[float], None]
 DIGITS = 5  # significant, of what is tried and written

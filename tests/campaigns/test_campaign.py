@@ -28,13 +28,13 @@ from malta.campaigns.result import Campaign, figures_of, rate, runs_within_bound
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
 from malta.campaigns.store import MANIFEST, block_name, read_plan
 from malta.campaigns.summary import worst_of
-from malta.files import temporary_name
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation.engine import compiled
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.engine.engines import engine_of, library_of
 from malta.simulation.experiments.catalogue import cases_of
+from malta.writing import temporary_name
 
 if TYPE_CHECKING:
     from conftest import Design

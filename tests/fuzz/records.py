@@ -34,7 +34,7 @@ from malta.report import campaign_tables
 from malta.report.page.document import binder_page, binder_text
 from malta.report.page.motion import motion_page, read_motion
 from malta.report.tables.experiments import findings_table
-from malta.simulation.trajectory import save as save_run
+from malta.simulation.trajectory_file import save as save_run
 from malta.tuning.search import Journal
 
 RARE, BOUND = "deviation-y1", 1.1e-6  # m, which few runs exceed

@@ -26,7 +26,7 @@ from malta.machines.tubular.experiments.strokes import (
 )
 from malta.simulation.experiments import Experiment
 from malta.simulation.scenario import Scenario
-from malta.simulation.trajectory import save
+from malta.simulation.trajectory_file import save
 from malta.synthesis.feedforward import static_feedforward
 
 if TYPE_CHECKING:

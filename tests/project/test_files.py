@@ -15,9 +15,10 @@ from conftest import refusal
 
 import malta
 from malta.campaigns.store import read_manifest
-from malta.files import read_file, replace_files, scratch_folder, temporary_name, writer
+from malta.files import read_file, scratch_folder
 from malta.gains.certified import check
 from malta.tables import load_toml
+from malta.writing import replace_files, temporary_name, writer
 
 
 def names(folder: Path) -> list[str]:

@@ -18,7 +18,7 @@ from conftest import ROOT, Run
 from page_examples import PROGRESS
 
 from malta.cli import output
-from malta.files import noting_files, replace_files
+from malta.writing import noting_files, replace_files
 
 TABLE2, ROBUST = "design/gains/table2.json", "design/gains/robust.json"
 

@@ -20,7 +20,8 @@ from test_report_page import HOSTILE, STRANGE, cart_controller
 
 from malta.cli.documents.loops import compare_output
 from malta.margins.verify import linear_report
-from malta.merits import MEANINGS, Merit, figure, find_best, four_digits
+from malta.merit_lists import find_best
+from malta.merits import MEANINGS, Merit, figure, four_digits
 from malta.report.page.analysis import Subject
 from malta.report.page.comparison import Comparison, MeritRow, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page

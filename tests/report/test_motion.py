@@ -28,7 +28,7 @@ from malta.report.page.motion import (
     place_points,
     read_motion,
 )
-from malta.simulation.trajectory import save
+from malta.simulation.trajectory_file import save
 
 if TYPE_CHECKING:
     from malta.report.page.motion import Animation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from malta.simulation.engine import engines
-from malta.simulation.engine.engines import SAMPLES_AT_ONCE, Loop, loop_of
+from malta.simulation.engine.sample_loops import SAMPLES_AT_ONCE, Loop, loop_of
 
 
 def damped() -> Loop:

@@ -16,13 +16,15 @@ from scipy.integrate import solve_ivp
 import malta
 from malta import references
 from malta.loops.sampled_loops import sampled_loop
-from malta.merits import Merit, by_identifier
+from malta.merit_lists import by_identifier
+from malta.merits import Merit
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
-from malta.simulation.trajectory import Verdict, bearing_verdict, save
+from malta.simulation.trajectory import Verdict, bearing_verdict
+from malta.simulation.trajectory_file import save
 from malta.synthesis.linear_law import linear_law
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from malta.merits import Merit, by_identifier
+from malta.merit_lists import by_identifier
+from malta.merits import Merit
 from malta.units import distinct
 
 if TYPE_CHECKING:

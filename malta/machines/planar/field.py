@@ -23,7 +23,8 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.machines.planar.parameters import COIL_ORDER, Parameters
-from malta.model.equations import look_up, note
+from malta.model.equations import note
+from malta.model.table_look_ups import look_up
 
 ORDER = 60  # of the field: the last harmonic has decayed to 2e-5 at z = 1 mm
 # Harmonic orders in x and y are `sin` (1) or `cos` (0) in the coil's position: mirroring the coil at x = 0 turns the

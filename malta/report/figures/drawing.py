@@ -15,13 +15,14 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import micro as micro, number as number
 from malta.errors import InputError
-from malta.files import PICTURES, replace_files, require_suffix
+from malta.files import PICTURES, require_suffix
 from malta.merits import ROOTS
 from malta.model.data import published_value
 from malta.model.plant import Plant
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

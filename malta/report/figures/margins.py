@@ -34,7 +34,7 @@ from malta.report.figures.drawing import (
     save_figure,
 )
 from malta.synthesis.requirements import Trade
-from malta.units import unit_factor
+from malta.units import FINE_UNITS, unit_factor
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -228,7 +228,6 @@ def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = 
 # The figure of how a machine takes loads from outside: deviation over time, and compliance over frequency.
 
 
-FINE_UNITS = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
 SHOWN_TIME_FACTOR = 1.5  # times the longest time to 1 %
 POINTS = 400  # of frequency
 # A line that covers another has gaps.

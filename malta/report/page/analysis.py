@@ -16,12 +16,12 @@ from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
-from malta.merits import Merit, in_groups
+from malta.merit_lists import in_groups
+from malta.merits import Merit
 from malta.model.linear.parameters import is_linear
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.model.plants import plant_of
-from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import Experiment, progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
@@ -35,7 +35,7 @@ from malta.synthesis.spec import (
     process_signals,
 )
 from malta.tuning.verify import verify, with_requirements
-from malta.units import identifier, in_unit
+from malta.units import FINE_UNITS, identifier, in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary

@@ -13,7 +13,8 @@ from rich.console import Group
 from rich.text import Text
 
 from malta.errors import InputError
-from malta.merits import Merit, by_identifier, find_best
+from malta.merit_lists import by_identifier, find_best
+from malta.merits import Merit
 from malta.report.page.analysis import (
     GROUPS,
     Analysis,

@@ -18,11 +18,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from malta.files import read_packaged, replace_files, require_suffix
+from malta.files import read_packaged, require_suffix
 from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.analysis import KeyFigure
 from malta.report.page.sections import Folded, Illustration, Item, PageTable, Section, plain_sheet, polish
 from malta.report.tables.experiments import finding_cells
+from malta.writing import replace_files
 
 if TYPE_CHECKING:
     import jinja2

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from malta.arguments import describe, is_number
 from malta.errors import InputError
-from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import MORE_STYLES, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Illustration, Item, PageTable, Section, distinct_channels, polish
 from malta.report.verdict import SIGNS, stairs_html
-from malta.units import in_unit
+from malta.units import FINE_UNITS, in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,6 @@ from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
 from malta.model.plant import Signal
-from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import micro
 from malta.report.page.analysis import Analysis, design_entries, display_unit, summary_sentences
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
@@ -43,7 +42,7 @@ from malta.report.tables.margins import (
     tolerance_table,
     worst_case_table,
 )
-from malta.units import in_unit
+from malta.units import FINE_UNITS, in_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

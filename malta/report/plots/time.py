@@ -10,7 +10,6 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.loops.steps import StepFigures, loop_steps, step_figures
-from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import draw_grid, micro, number
 from malta.report.plots.frequency import Channel, title_of
 from malta.report.plots.panels import (
@@ -28,7 +27,7 @@ from malta.report.plots.panels import (
     thin,
     write_above,
 )
-from malta.units import unit_factor
+from malta.units import FINE_UNITS, unit_factor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,13 +20,12 @@ from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zo
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel
 from malta.model.parameters import box_words
-from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table
 from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.requirements import Trade, requirements_for
-from malta.units import in_unit
+from malta.units import FINE_UNITS, in_unit
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray

@@ -43,7 +43,6 @@ from malta.model.parameters import units_of
 from malta.model.places import place_states, position_in
 from malta.model.plant import Plant, Signal
 from malta.model.plants import plant_of
-from malta.model.signal_groups import FINE_UNITS
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -67,6 +66,7 @@ from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import Payload
+from malta.units import FINE_UNITS
 
 # Experiments of any machine: hold still, step an output, push.
 #

@@ -16,7 +16,7 @@ from scipy.linalg import solveh_banded
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.merits import reported_merits
+from malta.merit_lists import reported_merits
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (

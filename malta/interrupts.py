@@ -1,0 +1,79 @@
+"""Ctrl-C: noted where libraries may drop the KeyboardInterrupt, and put off where files are renamed into place."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+Handler = Callable[[int, FrameType | None], Any]
+
+
+@contextmanager
+def watch_interrupts() -> Iterator[list[float]]:
+    """Note when Ctrl-C was pressed (s, monotonic), and let it raise as usual; nothing is noted outside the main thread.
+
+    Libraries may drop the KeyboardInterrupt: whoever watches can raise it again.
+    """
+    pressed: list[float] = []
+    handle = _usual_handler()
+    if handle is None:
+        yield pressed
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.append(time.monotonic())
+        handle(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, handle)
+
+
+def press_again() -> None:
+    """Press Ctrl-C for the main thread, also where it waits."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether an error is Ctrl-C: KeyboardInterrupt, or what C code makes of it, such as SystemError with that cause.
+
+    Example: `is_interrupt(KeyboardInterrupt())` is True.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
+
+
+@contextmanager
+def put_off_interrupts() -> Iterator[None]:
+    """Put Ctrl-C off to the end of a block."""
+    handle = _usual_handler()
+    if handle is None:
+        yield
+        return
+    frames: list[FrameType | None] = []
+    signal.signal(signal.SIGINT, lambda _, frame: frames.append(frame))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handle)
+    if frames:
+        handle(signal.SIGINT, frames[-1])
+
+
+def _usual_handler() -> Handler | None:
+    """What Ctrl-C does now; None outside the main thread, and where it is ignored."""
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        return None
+    return handler
