@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.linear.uncertain import Compensator, UncertainSystem, instability, responses
+from malta.linear.closed_loops import instability
+from malta.linear.open_loops import responses
+from malta.linear.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray

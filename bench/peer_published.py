@@ -16,7 +16,7 @@ import numpy as np
 from published_cases import Loop, Polynomial
 
 import malta
-from malta.linear.uncertain import instability
+from malta.linear.closed_loops import instability
 from malta.proof.robust import law_of
 
 if TYPE_CHECKING:

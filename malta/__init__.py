@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.learn import learn as learn
     from malta.identification.measure import measure as measure
     from malta.loops.loop import loop as loop
-    from malta.loops.parametric_plants import uncertain as uncertain
+    from malta.loops.uncertain_models import uncertain as uncertain
     from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
     from malta.model.inspection import inspect as inspect
@@ -96,7 +96,7 @@ _NAMES = {
     "malta.identification.learn": "learn",
     "malta.identification.measure": "measure",
     "malta.loops.loop": "loop",
-    "malta.loops.parametric_plants": "uncertain",
+    "malta.loops.uncertain_models": "uncertain",
     "malta.model.data": "read",
     "malta.model.equilibrium": "trim",
     "malta.model.inspection": "inspect",

@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 import malta
 from malta.linear.matrices import add_integrals
 from malta.linear.sampling import sample, sample_cost, sample_noise
-from malta.synthesis.lqg import integrals_of
+from malta.synthesis.regulators import integrals_of
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

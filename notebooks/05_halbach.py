@@ -18,7 +18,7 @@ from IPython.display import display
 import malta
 from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.machines.halbach.load_cell import fit_motor_law, simulated_record
-from malta.synthesis.filters import sampled_model
+from malta.synthesis.design_models import sampled_model
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

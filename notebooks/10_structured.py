@@ -19,7 +19,7 @@ from scipy import linalg
 
 import malta
 from malta import structured
-from malta.linear.reduction import minimal
+from malta.linear.minimal import minimal
 from malta.linear.system import System
 from malta.structured.loops import to_plane
 from malta.structured.riccati import split_integrals, truncate

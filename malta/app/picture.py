@@ -35,8 +35,8 @@ from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
 from malta.synthesis.controller import Controller
-from malta.synthesis.recovery import StepResponse
 from malta.synthesis.spec import Spec
+from malta.synthesis.step_response import StepResponse
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 

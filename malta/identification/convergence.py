@@ -39,9 +39,10 @@ from malta.arrays import ComplexArray
 from malta.errors import InputError
 from malta.identification.strokes import FORCE
 from malta.linear.branches import INTERVALS, Interval
+from malta.linear.closed_loops import closed_loop
 from malta.linear.interconnection import gain as of_gain, series
 from malta.linear.system import System
-from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
 from malta.model.plants import plant_of
 from malta.proof.blocks.gain import Gain, worst_case_gain

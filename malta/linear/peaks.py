@@ -221,43 +221,6 @@ def smooth_peak(system: System) -> float:
     return top + float((left[k[0]] - right[k[0]]) ** 2 / (8 * bend[k[0]])) if len(k) else top
 
 
-class Fall(NamedTuple):
-    """What is asked of a singular value: where it falls below a level for the first or the last time."""
-
-    rank: int  # of the singular value, 0 the largest
-    last: bool
-
-
-def fall_frequencies(system: System, level: float, asked: Sequence[Fall]) -> list[float]:
-    """The frequencies at which singular values of a square G, in balanced units, fall below a level.
-
-    0 where one never reaches the level, infinite where it never falls below.
-    """
-
-    parts = [part_of(system, own, own) for own in joined_channels(system, range(len(system.C)))]
-
-    def sizes(w: FloatArray) -> FloatArray:
-        each = [np.linalg.svd(response_at(part, w), compute_uv=False) for part in parts]
-        found = -np.sort(-np.concatenate(each, axis=1), axis=1)
-        return np.asarray(np.log(np.maximum(found, MIN_SINGULAR_VALUE) / level))
-
-    c = np.sort(np.concatenate([level_frequencies(part, level) for part in parts]))
-    c = c[c > 0]
-    w = np.concatenate([c[:1] / 2, np.sqrt(c[1:] * c[:-1]), 2 * c[-1:]]) if len(c) else np.ones(1)
-    above = sizes(w)
-    return [_fall(sizes, w, above, one) for one in asked]
-
-
-def _fall(sizes: Callable[[FloatArray], FloatArray], w: FloatArray, above: FloatArray, one: Fall) -> float:
-    mine = above[:, one.rank]
-    falls = np.flatnonzero((mine[:-1] >= 0) & (mine[1:] < 0))
-    if not len(falls):
-        return math.inf if mine[-1] >= 0 else 0.0
-    k = falls[[-1 if one.last else 0]]
-    low, high = (w[k], mine[k]), (w[k + 1], mine[k + 1])
-    return float(_false_position(lambda x: sizes(x)[:, one.rank], low, high)[0])
-
-
 def joined_channels(system: System, channels: Sequence[int]) -> list[list[int]]:
     """The channels in sets that nothing joins, each its input and output: the norm of all is the largest of a set."""
     n, c = len(system.A), len(channels)
@@ -349,14 +312,14 @@ def _roots(
     k = np.flatnonzero((y[1:] * y[:-1] < 0) & (seen[1:] | seen[:-1]))
     if not len(k):
         return []
-    at = _false_position(lambda x: measure(response_at(S, x)[:, 0, 0]), (w[k], y[k]), (w[k + 1], y[k + 1]))
+    at = false_position(lambda x: measure(response_at(S, x)[:, 0, 0]), (w[k], y[k]), (w[k + 1], y[k + 1]))
     return list(zip(at.tolist(), response_at(S, at)[:, 0, 0].tolist(), strict=True))
 
 
 Ends = tuple["FloatArray", "FloatArray"]
 
 
-def _false_position(measure: Callable[[FloatArray], FloatArray], low: Ends, high: Ends) -> FloatArray:
+def false_position(measure: Callable[[FloatArray], FloatArray], low: Ends, high: Ends) -> FloatArray:
     """A root of a measure in each interval, from its ends and the values there, which differ in sign (Illinois)."""
     (a, f), (b, g) = low, high
     kept = np.zeros(len(a))  # the end that stayed: -1 a, 1 b

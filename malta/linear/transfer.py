@@ -20,7 +20,7 @@ from flint import acb, acb_poly, arb, ctx, fmpq, fmpq_poly
 
 from malta.errors import InputError
 from malta.linear.interconnection import append, connect, gain, series
-from malta.linear.reduction import minimal
+from malta.linear.minimal import minimal
 from malta.linear.system import System
 
 BITS = 512  # of roots and sections

@@ -1,4 +1,4 @@
-"""A linear system with uncertain parameters and its compensator: their records, poles and frequency responses.
+"""A linear system with uncertain parameters and its compensator: their records.
 
 x' = A(p) x + B(p) u,  y = C(p) x        derived from a plant's CasADi model, parameters by name
 u = H F y                                 a control law F, and the lag, hold and delay H before the plant
@@ -6,19 +6,16 @@ u = H F y                                 a control law F, and the lag, hold and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy import sparse
 
 from malta.arguments import number
-from malta.arrays import ComplexArray, FloatArray
+from malta.arrays import FloatArray
 from malta.errors import InputError, require_known
-from malta.linear.sampling import add_lags, delay_inputs, sample, split_delay
 from malta.linear.system import System
 
 DOMAIN_END_TEXT = "a root or a branch of the model ends"
@@ -193,229 +190,3 @@ class Compensator:
     sample_time: float | None = None
     delay: float = 0
     lag: float | None = None
-
-
-def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:
-    """A and B of x', or of (x+ - x) / T for a sampled law."""
-    T = c.sample_time
-    return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
-
-
-def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
-    """State matrices of the closed loop at k rows of parameters; of sampled loops (A - 1) / T.
-
-    The states are those of plant, lags, stored inputs and compensator.
-    """
-    return _close(c, *system.at(p), *difference_form(c), c.C, c.D)
-
-
-def _close(
-    c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray,
-    F_A: FloatArray, F_B: FloatArray, F_C: FloatArray, F_D: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """State matrices of closed loops, of stacks of plants and of a law, with lag, hold and delay of the compensator.
-
-    The plant is in differences: slow poles lie close to 1, where the A of x+ = A x has lost their digits.
-    """
-    outputs = C.shape[-1]
-    if c.lag is not None:
-        A, B = add_lags(A, B, c.lag)
-    if c.sample_time is not None:
-        n, T = A.shape[-1], c.sample_time
-        _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
-        A, B = _store_inputs(A @ Phi / T, Phi @ B / T, _newest(A, B, c), c)
-    n = A.shape[-1]
-    whole = np.zeros((len(A), n + len(F_A), n + len(F_A)))
-    whole[:, :n, :n], whole[:, :n, n:], whole[:, n:, n:] = A, B @ F_C, F_A
-    whole[:, :n, :outputs] += B @ F_D @ C
-    whole[:, n:, :outputs] = F_B @ C
-    return whole
-
-
-def _newest(A: FloatArray, B: FloatArray, c: Compensator) -> FloatArray | None:
-    """What inputs leave in the last 1 - f of a sample, in differences, f the fraction of delay; None without one."""
-    T, part = c.sample_time, split_delay(c.delay)[1]
-    return None if T is None or not part else sample(A, B, (1 - part) * T)[1] / T
-
-
-def _store_inputs(
-    A: FloatArray, B: FloatArray, newest: FloatArray | None, c: Compensator
-) -> tuple[FloatArray, FloatArray]:
-    """A system in differences behind the delay of a sampled compensator; stored inputs follow x, the oldest first."""
-    n, T = A.shape[-1], float(c.sample_time or 0)
-    A, B = delay_inputs(A, B, c.delay, newest)
-    stored = np.arange(n, A.shape[-1])  # delay_inputs gives the next values of these
-    if len(stored):
-        B = B / T if newest is None else np.concatenate([B[..., :n, :], B[..., n:, :] / T], axis=-2)
-        A[..., n:, :] = A[..., n:, :] / T
-    A[..., stored, stored] -= 1 / T
-    return A, B
-
-
-def _poles(
-    system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[StateGroup]
-) -> ComplexArray:
-    """The poles of the closed loop at k rows of parameters, group by group; of sampled loops (lambda - 1) / T."""
-    A, B, C = system.at(p)
-    F_A, F_B = difference_form(c)
-    found = []
-    for g in groups:
-        x, own = list(g.states), list(g.own)
-        law = F_A[np.ix_(own, own)], F_B[own]
-        if not x:
-            found.append(np.broadcast_to(np.linalg.eigvals(law[0]), (len(A), len(own))))
-            continue
-        into, through, out = B[:, x], c.D, c.C[:, own]
-        if g.inputs is not None:  # forces on these states in place of the inputs
-            rows = B[:, list(g.inputs)]
-            into, through, out = np.eye(len(x))[:, [x.index(i) for i in g.inputs]], rows @ through, rows @ out
-        closed = _close(c, A[:, x][:, :, x], into, C[:, :, x], *law, out, through)
-        found.append(np.linalg.eigvals(closed))
-    return np.concatenate(found, axis=1)
-
-
-def instability(
-    system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[StateGroup] = ()
-) -> FloatArray:
-    """The real part of the worst pole at k rows of parameters, 1/s; of sampled loops ln|lambda| / T.
-
-    groups : states that close loops by themselves; none: the whole loop
-    """
-    poles = _poles(system, c, p, groups) if groups else _eigenvalues(closed_loop(system, c, p))
-    if c.sample_time is not None:
-        T = c.sample_time
-        grown = (2 * T * poles.real + T**2 * np.abs(poles) ** 2).max(axis=1)  # |lambda|^2 - 1
-        return np.asarray(np.log1p(np.maximum(grown, -1 + 1e-15)) / (2 * T))
-    return np.asarray(poles.real.max(axis=1))
-
-
-def _eigenvalues(matrices: FloatArray) -> ComplexArray:
-    """The eigenvalues of k matrices of one structure: of each set of states that act on each other by itself."""
-    joined = (matrices != 0).any(axis=0)
-    count, label = sparse.csgraph.connected_components(joined, connection="strong")
-    sets = [np.flatnonzero(label == k) for k in range(count)]
-    return np.concatenate([np.linalg.eigvals(matrices[:, i[:, None], i]) for i in sets], axis=1)
-
-
-def critical_frequency(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
-    """The frequency of the worst pole at one row of parameters, rad/s."""
-    (poles,) = np.linalg.eigvals(closed_loop(system, c, p))
-    T = c.sample_time
-    return worst_frequency(poles if T is None else T * poles, T)
-
-
-def worst_frequency(poles: ComplexArray, T: float | None) -> float:
-    """The frequency of the worst of some poles, rad/s; of sampled loops these are z - 1."""
-    if T is None:
-        return float(abs(poles[poles.real.argmax()].imag))
-    z = 1 + poles
-    return float(abs(np.angle(z[np.abs(z).argmax()])) / T)
-
-
-# Frequency responses of a loop's parts, and the peaks and crossings of what is computed from them.
-
-
-MAX_DIRECT_FREQUENCIES = 32  # frequencies at which a system is solved as a whole
-
-
-class ResponseMatrices(NamedTuple):
-    """Frequency responses, one matrix for each frequency."""
-
-    G_y: ComplexArray  # k x p x m: commands -> sensors, with lag, hold and delay
-    G_d: ComplexArray  # k x p x m: forces on the plant -> sensors
-    H: ComplexArray  # k x m x m: commands -> forces
-    F: ComplexArray  # k x m x p: sensors -> commands
-
-
-def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: FloatArray) -> ResponseMatrices:
-    """The responses of system and compensator at frequencies w, rad/s.
-
-    p : one row of parameters, or a row for each frequency
-
-    G(s) = C (s E - A)^-1 B + D behind a lag w_c / (s + w_c); of a sampled loop the exact discrete system under a
-    zero-order hold at z = e^(j w T), times z^-delay. Differences (z - 1) / T keep the digits of slow modes.
-    """
-    A, B, C, D, newest = _plant(system, law, np.asarray(p, dtype=float).tobytes())
-    s, turned, F = _law(law, np.asarray(w, dtype=float).tobytes())
-    m, q = len(law.D), C.shape[1] - len(law.D)
-    if newest is not None and law.sample_time is not None:
-        # What was commanded a sample before acts for the fraction of the delay.
-        older = np.exp(-1j * np.asarray(w, dtype=float) * law.sample_time)[:, None, None]
-        B, D = newest + (B - newest) * older, D * older
-    G = (C @ _resolvent(s, A, B) + D) * turned[:, None, None]
-    return ResponseMatrices(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
-
-
-def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
-    """(s - A)^-1 B at each s, of one system or of one for each s; parts of a system without couplings one by one."""
-    n = A.shape[-1]
-    found = np.zeros((len(s), n, B.shape[-1]), dtype=complex)
-    parts = [np.arange(n)]
-    if len(s) > MAX_DIRECT_FREQUENCIES:
-        count, label = sparse.csgraph.connected_components((A != 0).any(axis=0), directed=False)
-        parts = [np.flatnonzero(label == k) for k in range(count)]
-    for x in parts:
-        used = np.flatnonzero((B[:, x] != 0).any(axis=(0, 1)))
-        own = s[:, None, None] * np.eye(len(x)) - A[:, x[:, None], x]
-        found[:, x[:, None], used] = np.linalg.solve(own, B[:, x[:, None], used])
-    return found
-
-
-def open_systems(system: UncertainSystem, law: Compensator, p: FloatArray) -> tuple[System, System]:
-    """y = P u, with lag, hold and delay, and u = F y at one row of parameters; in differences when sampled."""
-    m, T = len(law.D), law.sample_time
-    *plant, newest = _plant(system, law, np.asarray(p, dtype=float).tobytes())
-    A, B, C, D = (M[0] for M in plant)
-    q, n = len(C) - m, len(A)
-    B, C, D = B[:, :m], C[:q], D[:q, :m]
-    if T is not None and law.delay:
-        A, B = _store_inputs(A, B, None if newest is None else newest[0, :, :m], law)
-        C, D = np.hstack([C, D, np.zeros((q, len(A) - n - m))]), np.zeros((q, m))
-    return System(A, B, C, D), System(*difference_form(law), law.C, law.D)
-
-
-NUDGE = 1e-9  # of the way to the nominal parameters
-Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray", "FloatArray | None"]
-
-
-@lru_cache(maxsize=4)  # an ascent moves p or w and returns; records compare by identity
-def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
-    """A, B, C and D from commands and from forces on the plant to sensors and forces; in differences when sampled.
-
-    They are stacks, for each row of parameters. With a fraction of a sample of delay, what `_newest` says follows.
-    """
-    names = len(system.names)
-    places = np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0))
-    try:
-        A, B, C, D = system.explicit(places)
-    except np.linalg.LinAlgError:  # a search meets a singular E, as at an end of its box: beside it
-        A, B, C, D = system.explicit(places + NUDGE * (system.nominal - places))
-    rows, n, m = B.shape
-    k, q = n if law.lag is None else n + m, C.shape[1]
-    into, out, through = (np.zeros((rows, *shape)) for shape in ((k, 2 * m), (q + m, k), (q + m, 2 * m)))
-    into[:, :n, m:], out[:, :q, :n], through[:, :q, m:] = B, C, D
-    if law.lag is None:
-        into[:, :n, :m], through[:, :q, :m], through[:, q:, :m] = B, D, np.eye(m)
-    else:
-        A, into[:, :, :m] = add_lags(A, B, law.lag)
-        out[:, :q, n:], out[:, q:, n:] = D, np.eye(m)
-    T = law.sample_time
-    if T is None:
-        return A, into, out, through, None
-    if system.sample_time is not None:
-        return (A - np.eye(A.shape[-1])) / T, into / T, out, through, None
-    _, Phi = sample(A, np.eye(A.shape[-1]), T)  # (e^AT - 1) / T = A Phi / T
-    return A @ Phi / T, Phi @ into / T, out, through, _newest(A, into, law)
-
-
-@lru_cache(maxsize=4)
-def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """s, or (z - 1) / T when sampled; z^-d of d whole samples; and F: at frequencies w."""
-    T = law.sample_time
-    s: ComplexArray = 1j * np.frombuffer(w)
-    turned = np.ones_like(s)
-    if T is not None:
-        turned, s = np.exp(-s * T * split_delay(law.delay)[0]), np.expm1(s * T) / T
-    F_A, F_B = difference_form(law)
-    F = law.C @ _resolvent(s, F_A[None], F_B[None]) + law.D
-    return s, turned, np.asarray(F, dtype=complex)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -16,10 +16,8 @@ from malta.linear.interconnection import append, connect, series
 from malta.linear.matrices import eigenvalues
 from malta.linear.peaks import (
     Crossing,
-    Fall,
     Peak,
     about_poles,
-    fall_frequencies,
     gain_crossings,
     in_plane,
     joined_channels,
@@ -28,11 +26,9 @@ from malta.linear.peaks import (
     of_plane,
     part_of,
     peak_gain,
-    phase_crossings,
     response_at,
 )
 from malta.linear.system import System
-from malta.linear.uncertain import Compensator, UncertainSystem, instability, open_systems
 
 ROUNDS = 60  # of the balance of a matrix at most
 BALANCE_TOLERANCE = 1e-9  # relative difference of norms of rows and columns
@@ -111,12 +107,6 @@ class Nominal:
         return part_of(self.closed, [channel], [channel])
 
 
-def nominal_loop(system: UncertainSystem, law: Compensator) -> Nominal:
-    """A loop at its nominal parameters."""
-    stable = bool(instability(system, law, system.nominal)[0] < 0)
-    return Nominal(*open_systems(system, law, system.nominal), stable, law.sample_time)
-
-
 @dataclass(frozen=True)
 class Disk:
     """A symmetric disk margin: factors (1 + d/2) / (1 - d/2) with |d| < size in the channels keep the loop stable."""
@@ -187,40 +177,16 @@ def disk_margin(loop: Nominal, kind: Kind) -> Disk:
     chosen = {"forces": [*loop.inputs], "sensors": [*loop.sensors]}
     channels = chosen.get(kind, [*loop.sensors, *loop.inputs])
     found = [
-        _largest_mu(_disk_system(part_of(loop.closed, own, own)))
+        _largest_mu(disk_system(part_of(loop.closed, own, own)))
         for own in joined_channels(loop.closed, channels)
     ]
     mu, at = max(found)
     return Disk(kind, 1 / mu, loop.frequency(at))
 
 
-def _disk_system(S: System) -> System:
+def disk_system(S: System) -> System:
     """S - 1/2."""
     return replace(S, D=S.D - np.eye(len(S.D)) / 2)
-
-
-def peak_of_channels(loop: Nominal, channels: Sequence[int]) -> Peak:
-    """The largest sigma_max of the sensitivities of some channels of `loop.closed`, cut at once."""
-    sets = joined_channels(loop.closed, channels)
-    value, at = largest_gain(part_of(loop.closed, own, own) for own in sets)
-    return Peak(value, loop.frequency(at))
-
-
-def tracked_band(loop: Nominal, rank: int | None = None) -> tuple[float, float]:
-    """Where the smallest singular value of T first falls below 1 / sqrt(2), and the largest for the last time, rad/s.
-
-    rank : of T, where it is less than the number of sensors
-    """
-    S, p = part_of(loop.closed, loop.sensors, loop.sensors), len(loop.sensors)
-    T = replace(S, D=S.D - np.eye(p))
-    smallest, largest = Fall((rank or p) - 1, last=False), Fall(0, last=True)
-    first, last = fall_frequencies(T, math.sqrt(0.5), (smallest, largest))
-    return loop.frequency(first), loop.frequency(last)
-
-
-def last_crossover(loop: Nominal) -> float:
-    """Where the largest singular value of the loop gain falls below 1 for the last time, rad/s."""
-    return loop.frequency(fall_frequencies(loop.open, 1.0, (Fall(0, last=True),))[0])
 
 
 def _largest_mu(M: System) -> Peak:
@@ -265,7 +231,7 @@ def loop_at_forces(P: ComplexArray, F: ComplexArray, forces: int | None) -> Comp
 
 def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
     """The symmetric disk margin of each sensor alone, in the order of the rows of y."""
-    peaks = [peak_gain(_disk_system(loop.sensitivity(i))) for i in loop.sensors]
+    peaks = [peak_gain(disk_system(loop.sensitivity(i))) for i in loop.sensors]
     return [
         Disk(f"{name} alone", 1 / mu, loop.frequency(at))
         for name, (mu, at) in zip(sensors, peaks, strict=True)
@@ -314,14 +280,6 @@ def crossings_at(loop: Nominal, channel: int) -> tuple[Crossing, ...]:
     return tuple(Crossing(loop.frequency(w), value) for w, value in found)
 
 
-def peak_sensitivity(loop: Nominal, at: Literal["forces", "sensors"]) -> float:
-    """The largest |S_ii| over all frequencies and channels at nominal parameters; NaN for an unstable loop."""
-    if not loop.stable:
-        return float("nan")
-    channels = loop.inputs if at == "forces" else loop.sensors
-    return largest_gain(loop.sensitivity(i) for i in channels).value
-
-
 def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
     """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency."""
 
@@ -338,54 +296,6 @@ def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
     return found
 
 
-# The margins of one channel at a time, the others closed, at exact crossings; of unstable open loops as well.
-#
-# l = T_ii / S_ii        what channel i sees around itself, negative feedback
-# 1 + k l(jw) = 0        at the factors k = -1 / l where l is real and negative: 0, the Nyquist frequency and
-#                        infinity among them. The nearest below and above 1 bound the stable ones.
-
-
-MAX_GAIN_FACTOR = 1e6  # factors of gain beyond which a margin counts as infinite
-
-
-@dataclass(frozen=True)
-class ChannelMargins:
-    """The classical margins of one channel, the others closed. NaN for an unstable loop.
-
-    The loop is stable for every factor of gain in `gain` and for none next to it: an open loop that is unstable has a
-    lower bound as well. Encirclements of -1 are counted counterclockwise, over negative and positive frequencies.
-    """
-
-    channel: str
-    stable: bool  # the closed loop
-    gain: tuple[float, float]  # factors; 0 and inf where nothing bounds them
-    gain_frequency: tuple[float, float]  # rad/s; NaN where nothing bounds them
-    phase: float  # rad, the smallest turn of either sign; inf without a gain crossing
-    phase_frequency: float  # rad/s
-    delay: float  # s; inf without a gain crossing
-    delay_frequency: float  # rad/s
-    disk: Disk  # symmetric
-    peak_sensitivity: float  # max |S_ii|; its inverse is the modulus margin
-    peak_frequency: float  # rad/s
-    unstable_poles: int  # with this channel open; poles on the axis count as stable
-    encirclements: int  # unstable_poles minus those of the closed loop
-    gain_crossings: tuple[Crossing, ...]  # |l| = 1
-    phase_crossings: tuple[Crossing, ...]  # l < 0
-
-    @property
-    def modulus(self) -> float:
-        """The modulus margin, the shortest distance of l(jw) from -1: 1 / max |S_ii|."""
-        return 1 / self.peak_sensitivity
-
-
-def gain_range(crossings: Sequence[Crossing]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The factors about 1 that no crossing lies between, and the frequencies of both bounds."""
-    factors = [(-1 / c.value.real, c.frequency) for c in crossings if c.value.real < 0]
-    below = max((f for f in factors if 1 / MAX_GAIN_FACTOR < f[0] < 1), default=(0.0, math.nan))
-    above = min((f for f in factors if 1 <= f[0] < MAX_GAIN_FACTOR), default=(math.inf, math.nan))
-    return (below[0], above[0]), (below[1], above[1])
-
-
 def phase_and_delay(crossings: Sequence[Crossing]) -> tuple[float, float, float, float]:
     """The smallest turn (rad) and the shortest delay (s) that reach -1, each with its frequency."""
     turns, delays = [], []
@@ -395,33 +305,3 @@ def phase_and_delay(crossings: Sequence[Crossing]) -> tuple[float, float, float,
         delays.append((lag / w, w))
     none = (math.inf, math.nan)
     return *min(turns, default=none), *min(delays, default=none)
-
-
-def channel_margins(loop: Nominal, channel: int, name: str, unstable: tuple[int, int]) -> ChannelMargins:
-    """The margins of one channel of `loop.closed`, the others closed.
-
-    unstable : poles of the loop that grow, with this channel open and closed
-    """
-    S, stable, nan = loop.sensitivity(channel).balanced, unstable[1] == 0, math.nan
-    gains = crossings_at(loop, channel)
-    phases = tuple(Crossing(loop.frequency(w), value) for w, value in phase_crossings(S))
-    values: dict[str, Any] = dict.fromkeys(("phase", "phase_frequency", "delay", "delay_frequency"), nan)
-    gain, at, half, peak = (nan, nan), (nan, nan), Peak(nan, nan), Peak(nan, nan)
-    if stable:
-        gain, at = gain_range(phases)
-        values = dict(zip(values, phase_and_delay(gains), strict=True))
-        half, peak = peak_gain(_disk_system(S)), peak_gain(S)
-    return ChannelMargins(
-        channel=name,
-        stable=stable,
-        gain=gain,
-        gain_frequency=at,
-        **values,
-        disk=Disk(name, 1 / half.value, loop.frequency(half.frequency)),
-        peak_sensitivity=peak.value,
-        peak_frequency=loop.frequency(peak.frequency),
-        unstable_poles=unstable[0],
-        encirclements=unstable[0] - unstable[1],
-        gain_crossings=gains,
-        phase_crossings=phases,
-    )

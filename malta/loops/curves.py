@@ -24,7 +24,8 @@ from malta.errors import require_known
 from malta.linear.interconnection import series
 from malta.linear.peaks import Crossing
 from malta.linear.system import System
-from malta.loops.classical import ChannelMargins, channel_margins, crossings_at, loop_at_forces
+from malta.loops.channel_margins import ChannelMargins, channel_margins
+from malta.loops.classical import crossings_at, loop_at_forces
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.plant import Signal
 from malta.processes import on_one_thread

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -15,11 +14,10 @@ import numpy as np
 from malta.arguments import describe
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError, require_known
-from malta.linear import rational
+from malta.linear import rational_tables
 from malta.linear.branches import without_branches
 from malta.linear.expressions import NotAnalytic, program
-from malta.linear.rational import Ratio, TooLarge
-from malta.linear.systems import from_source
+from malta.linear.rational import Ratio, Table, TooLarge, product, symbolic as rational_functions
 from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
 from malta.loops.rest import Condition, Formula, command_of, limits_at_rest, rest_of
 from malta.loops.windings import WindingModel, with_windings
@@ -148,7 +146,7 @@ def is_dear(system: UncertainSystem) -> bool:
     if system.matrices.size1_out(0) < MIN_DEAR_STATES or not program(system.matrices).rational:
         return False
     try:
-        A = rational.symbolic(program(system.matrices)).entries[0]
+        A = rational_functions(program(system.matrices)).entries[0]
     except (TooLarge, NotAnalytic):
         return False
     for r in A.values():
@@ -218,37 +216,43 @@ def _expanded_matrices(
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:
-        s, tables, above = rational.expand_matrices(model, scales)
+        s, tables, above = rational_tables.expand_matrices(model, scales)
     except (TooLarge, NotAnalytic):
         return None
     A, B, C, E, made, ratio, preload = tables
     zero = Ratio(s.context.constant(0))
     acting = {k + i: preload.get((i, 0), zero) for i in range(m)}
-    left = {i: acting[k + i] - rational.substitute(s, made.get((i, 0), zero), acting) for i in range(m)}
-    slope = {at: rational.substitute(s, r, acting) for at, r in ratio.items()}
+    left = {
+        i: acting[k + i] - rational_tables.substitute(s, made.get((i, 0), zero), acting) for i in range(m)
+    }
+    slope = {at: rational_tables.substitute(s, r, acting) for at, r in ratio.items()}
     if not all((slope[at] - r).is_zero() for at, r in ratio.items()):
         return None  # one step finds the command of a chain that is affine in it, and of no other
     ratio = slope
-    moved = rational.solution(s, ratio, left, m)  # what is wanted beyond the preload for it to act
+    moved = rational_tables.solution(s, ratio, left, m)  # what is wanted beyond the preload for it to act
     wanted = {k + i: acting[k + i] + moved[i] for i in range(m)}
-    A, B, C, E = ({at: rational.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
+    A, B, C, E = ({at: rational_tables.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
     n, outputs = of.size1_out(0), of.size1_out(2)
-    rest: rational.Table = {}
+    rest: Table = {}
     if held is not None:
-        carried = rational.product(E, C)
-        A = rational.drop_rounding(s, rational.difference(A, carried), scales, A, carried)
+        carried = product(E, C)
+        A = rational_tables.drop_rounding(s, rational_tables.difference(A, carried), scales, A, carried)
         gains = {(i, j): s.constant(float(x)) for (i, j), x in np.ndenumerate(held) if x}
-        rest = rational.drop_rounding(s, rational.difference(E, rational.product(B, gains)), scales, E)
-    held_above = {(i, 0): rational.substitute(s, r, wanted) for i, r in enumerate(above)}
-    if not rational.is_free_of_functions(s, (A, B, C, rest, held_above)):
+        rest = rational_tables.drop_rounding(s, rational_tables.difference(E, product(B, gains)), scales, E)
+    held_above = {(i, 0): rational_tables.substitute(s, r, wanted) for i, r in enumerate(above)}
+    if not rational_tables.is_free_of_functions(s, (A, B, C, rest, held_above)):
         return None
-    b = rational.matrix_of(B, (n, m), p)
+    b = rational_tables.matrix_of(B, (n, m), p)
     if rest:
-        b = ca.horzcat(b, rational.matrix_of(rest, (n, outputs), p))
-    a, c = rational.matrix_of(A, (n, n), p), rational.matrix_of(C, (outputs, n), p)
-    above_zero = ca.vertcat(*(rational.expression(r, p) for r in held_above.values()))
+        b = ca.horzcat(b, rational_tables.matrix_of(rest, (n, outputs), p))
+    a, c = rational_tables.matrix_of(A, (n, n), p), rational_tables.matrix_of(C, (outputs, n), p)
+    above_zero = ca.vertcat(*(rational_tables.expression(r, p) for r in held_above.values()))
     command = {(i, 0): wanted[k + i] for i in range(m)}
-    v = rational.matrix_of(command, (m, 1), p) if rational.is_free_of_functions(s, (command,)) else None
+    v = (
+        rational_tables.matrix_of(command, (m, 1), p)
+        if rational_tables.is_free_of_functions(s, (command,))
+        else None
+    )
     return a, b, c, above_zero, v
 
 
@@ -333,33 +337,3 @@ def limits_of(declared: Mapping[str, Any]) -> tuple[float, float]:
     found = [] if above is None else [float(above)]
     found += [] if least is None else [math.nextafter(float(least), -math.inf)]
     return max(found, default=-math.inf), math.inf if below is None else float(below)
-
-
-def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
-    """Make a linear system that depends on parameters by name.
-
-        E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u
-
-    source : a Plant, which is linearized with these parameters; a function of the parameters by name (or of one array
-        p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a casadi.Function of p; or
-        matrices A0, B0, C0[, D0[, E0]]
-    names : of a Plant the names of its parameters; else their nominal values by name, SI
-    options : of a Plant `x`, the states to linearize at; of the others `terms`, the factors of each parameter beside
-        matrices, as {"k": (A1, B1, C1)}; `limits` (above, below) of parameters; `sample_time` (s) of matrices that give
-        x+ in place of x'
-
-    Returns an UncertainSystem.
-
-    Raises InputError for unknown options, and for names, shapes and values that do not fit.
-
-    >>> import malta
-    >>> def motor(J, b):
-    ...     return [[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]
-    >>> system = malta.uncertain(motor, {"J": 2e-3, "b": 0.1})
-    >>> system.names
-    ('J', 'b')
-    """
-    made = of_plant if isinstance(source, Plant) else from_source
-    known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
-    require_known(options, known, "uncertain", found="an unknown option")
-    return made(source, names, **options)

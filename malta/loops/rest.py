@@ -27,7 +27,7 @@ import numpy as np
 from flint.utils.flint_exceptions import DomainError
 
 from malta.arrays import FloatArray
-from malta.linear import rational
+from malta.linear import rational_tables as rational
 from malta.linear.branches import SYMBOLS, resolve_branches
 from malta.linear.expressions import MatrixProgram, NotAnalytic, program
 from malta.linear.implicit import call, implicit_function

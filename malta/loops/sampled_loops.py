@@ -58,7 +58,7 @@ from malta.model.traced import trace
 from malta.synthesis.controller import Controller
 from malta.synthesis.law import law_at
 from malta.synthesis.linear_law import LinearLaw, linear_law, with_forces_read, with_readings, with_slope
-from malta.synthesis.recovery import StepResponse, step_response
+from malta.synthesis.step_response import StepResponse, step_response
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
 

@@ -13,7 +13,7 @@ from malta.linear.sampling import sample
 from malta.linear.system import System
 from malta.loops.linear_loops import LinearLoop
 from malta.processes import on_one_thread
-from malta.synthesis.recovery import StepResponse, step_response
+from malta.synthesis.step_response import StepResponse, step_response
 
 SETTLED_SHARE = 0.02  # of the final value, or of the largest one where the answer returns to zero
 SAMPLE_SHARE = 0.05  # of the fastest time constant: a sample of a continuous loop

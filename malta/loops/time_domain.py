@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,8 +31,11 @@ from malta.model.places import position_in
 from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
-from malta.synthesis.recovery import RecoveryBound, StepResponse
 from malta.synthesis.requirements import NoiseRms
+from malta.synthesis.step_response import StepResponse
+
+if TYPE_CHECKING:
+    from malta.synthesis.recovery import RecoveryBound
 
 RECOVERY_TIMES = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation

@@ -20,7 +20,8 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
-from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop, instability
+from malta.linear.closed_loops import closed_loop, instability
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import continuous_poles
 from malta.margins.travel import extent_of, travel_loops, travel_margin
 from malta.model.parameters import units_of

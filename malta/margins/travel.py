@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.linear.closed_loops import instability
 from malta.linear.expressions import NotAnalytic
-from malta.linear.uncertain import Compensator, UncertainSystem, instability
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
 from malta.loops.parametric_plants import MAX_MODEL_OPERATIONS, model_of
 from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system

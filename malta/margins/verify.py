@@ -15,19 +15,13 @@ from typing import Any, Literal
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.linear.closed_loops import instability
 from malta.linear.matrices import eigenvalues, system_matrix
+from malta.linear.open_loops import open_systems
 from malta.linear.peaks import peak_gain
-from malta.linear.uncertain import Compensator
-from malta.loops.classical import (
-    Classical,
-    classical_margins,
-    last_crossover,
-    nominal_loop,
-    peak_of_channels,
-    peak_sensitivity,
-    tracked_band,
-    worst_of,
-)
+from malta.linear.uncertain import Compensator, UncertainSystem
+from malta.loops.bandwidths import last_crossover, peak_of_channels, peak_sensitivity, tracked_band
+from malta.loops.classical import Classical, Nominal, classical_margins, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import (
@@ -60,9 +54,10 @@ from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import gain_at_rest
-from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
+from malta.synthesis.filters import gain_at_rest, kalman
+from malta.synthesis.regulators import integrals_of, lqi, lqr
 from malta.synthesis.separation import controller_poles
+from malta.synthesis.weighting import weights_of
 from malta.work import Budget, count_work
 
 
@@ -418,3 +413,9 @@ def _places(q: _Question) -> tuple[tuple[TravelPlace, ...], Classical | None]:
         places.append(TravelPlace(positions[0], margin, peak, disk, delay))
         q.report()
     return tuple(places), worst_of(classical)
+
+
+def nominal_loop(system: UncertainSystem, law: Compensator) -> Nominal:
+    """A loop at its nominal parameters."""
+    stable = bool(instability(system, law, system.nominal)[0] < 0)
+    return Nominal(*open_systems(system, law, system.nominal), stable, law.sample_time)

@@ -20,7 +20,7 @@ import numpy as np
 from malta.arguments import describe
 from malta.arrays import readonly
 from malta.errors import InputError
-from malta.linear import interconnection
+from malta.linear import diagrams, interconnection
 from malta.linear.compensators import compensator_of
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
@@ -86,7 +86,7 @@ def parallel(*systems: Any) -> UncertainSystem:
     0.5
     """
     whole = _Connection.of(systems, "parallel")
-    return whole.system(interconnection.parallel(*whole.parts))
+    return whole.system(diagrams.parallel(*whole.parts))
 
 
 def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
@@ -115,7 +115,7 @@ def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
     whole = _Connection.of((system, law), caller)
     if sign not in (-1, 1):
         raise InputError(caller, "sign", describe(sign), "-1 or 1")
-    return whole.system(interconnection.feedback(whole.parts[0], whole.parts[1], sign))
+    return whole.system(diagrams.feedback(whole.parts[0], whole.parts[1], sign))
 
 
 def interconnect(
@@ -154,7 +154,7 @@ def interconnect(
         replace(part, inputs=tuple(into), outputs=tuple(out))
         for part, (_, into, out) in zip(whole.parts, named, strict=True)
     ]
-    return whole.system(interconnection.interconnect(parts, _names_of(inputs), _names_of(outputs)))
+    return whole.system(diagrams.interconnect(parts, _names_of(inputs), _names_of(outputs)))
 
 
 def _with_names(one: Any, caller: str) -> tuple[Any, list[str], list[str]]:

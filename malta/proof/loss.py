@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError
+from malta.linear.closed_loops import critical_frequency, instability
 from malta.linear.expressions import NotAnalytic
-from malta.linear.uncertain import Compensator, UncertainSystem, critical_frequency, instability
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.exclusion.witness import Zero, gradients
 from malta.work import is_past
 

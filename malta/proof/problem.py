@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from flint import acb, arb, arb_mat, fmpq
 
-from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, exact
-from malta.linear.rational import Symbolic, TooLarge, over_common_denominator, symbolic
-from malta.linear.uncertain import (
-    Compensator,
-    StateGroup,
-    UncertainSystem,
+from malta.linear.closed_loops import (
     closed_loop as closed_matrices,
     critical_frequency,
     instability,
     worst_frequency,
 )
+from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, exact
+from malta.linear.rational import Symbolic, TooLarge, over_common_denominator, symbolic
+from malta.linear.uncertain import Compensator, StateGroup, UncertainSystem
 from malta.proof.groups import UncertainLoop, groups
 from malta.proof.polynomial.characteristic import Characteristic, map_bilinear, map_bounds, pair
 from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts

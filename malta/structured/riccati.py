@@ -31,7 +31,8 @@ from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
-from malta.linear.interconnection import append, gain, interconnect, lft, series
+from malta.linear.diagrams import interconnect, lft
+from malta.linear.interconnection import append, gain, series
 from malta.linear.matrices import system_matrix
 from malta.linear.peaks import peak_gain
 from malta.linear.reduction import balanced_reduction

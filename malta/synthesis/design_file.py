@@ -57,12 +57,12 @@ from malta.synthesis.spec import (
     Spec,
     StructuredLaw,
     Variable,
-    Weights,
     integral_signals,
     pid_signals,
     process_signals,
 )
 from malta.synthesis.structure import read_structure
+from malta.synthesis.weighting import Weights
 from malta.tables import Quantity, load_toml, validate
 from malta.units import to_si
 

@@ -14,7 +14,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.linear.interconnection import feedback, parallel
+from malta.linear.diagrams import feedback, parallel
 from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 

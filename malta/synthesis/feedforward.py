@@ -18,7 +18,7 @@ from malta.model.linearize import LinearModel
 from malta.model.places import off_stroke
 from malta.model.plant import Plant
 from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits, holding_gain
-from malta.synthesis.filters import between_samples
+from malta.synthesis.design_models import between_samples
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
 V0_STEPS = 16  # at least, either way

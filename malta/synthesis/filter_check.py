@@ -23,9 +23,10 @@ from malta.linear.matrices import eigenvalues
 from malta.model.linearize import LinearModel, linearize
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import Noisy, covariance, filter_gain, innovations, intensities, sampled_noise
+from malta.synthesis.filters import intensities
 from malta.synthesis.law import point_at
 from malta.synthesis.riccati import EPS, care, lyapunov
+from malta.synthesis.sampled_filters import Noisy, covariance, filter_gain, innovations, sampled_noise
 from malta.synthesis.spec import Spec
 
 SETTLED_SHARE = 1e-10  # of a covariance: what may be left of where it began

@@ -22,14 +22,12 @@ of disturbance on each input, which the regulator takes off again.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from numbers import Real
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
@@ -39,208 +37,15 @@ from malta.linear.sampling import sample, sample_cost, split_delay, stored_block
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
+from malta.synthesis.design_models import between_samples, sampled_model, with_lags
 from malta.synthesis.feedforward import machine_part
-from malta.synthesis.filters import (
-    Gains,
-    Linear,
-    between_samples,
-    kalman as kalman,
-    positions_from,
-    sampled_filter,
-    sampled_model,
-    with_lags,
-)
-from malta.synthesis.riccati import Solver, care, dare
-from malta.synthesis.spec import Discretization, Weights
-
-# Why a linear model has no stabilizing controller, in words: modes that nothing moves or sees, zeros, slow samples.
-
-
-SINGULAR_SIZE = (
-    1e-10  # of [pole I - A, B] on scales that balance A, in units of A: a smaller one is out of reach
-)
-SHARE = 0.1  # of its largest entry: a state with more of it carries a mode
-LONG_SAMPLE_GROWTH = 1.0  # a sample in which an unstable mode grows by e or more
-
-
-class LostMode(NamedTuple):
-    """A mode that is not stable and that inputs do not move.
-
-    pole : rad/s
-    states : of A that carry it, by index
-    """
-
-    pole: complex
-    states: tuple[int, ...]
-
-
-def lost_modes(A: FloatArray, B: FloatArray) -> list[LostMode]:
-    """The modes of x' = A x + B u that are not stable and that u does not move: rank [pole I - A, B] < n (Hautus).
-
-    A' and C' in place of A and B give the modes that y = C x does not see.
-    """
-    balanced, (scale, _) = linalg.matrix_balance(A, permute=False, separate=True)
-    size = float(np.abs(balanced).max()) or 1.0
-    pushed = B / scale[:, None]
-    columns = np.linalg.norm(pushed, axis=0)
-    pushed = pushed * np.divide(size, columns, out=np.zeros_like(columns), where=columns > 0)
-    found: list[LostMode] = []
-    for pole in linalg.eigvals(balanced):
-        if pole.imag < 0 or pole.real < -1e-9 * size:
-            continue
-        u, s, _ = linalg.svd(np.hstack([pole * np.eye(len(A)) - balanced, pushed]))
-        if s[-1] < SINGULAR_SIZE * size and all(abs(pole - one.pole) > 1e-6 * size for one in found):
-            found.append(LostMode(complex(pole), _carriers(u[:, -1])))
-    return found
-
-
-def _carriers(vector: ComplexArray) -> tuple[int, ...]:
-    size = np.abs(vector)
-    return tuple(int(i) for i in np.flatnonzero(size > SHARE * size.max()))
-
-
-def obstacle(model: LinearModel, weights: Weights, Ts: float) -> str:
-    """Why no controller of this model stabilizes it, in one sentence; "" where none of these reasons holds.
-
-    Ts : sample time, s
-    """
-    A = between_samples(model).A
-    states = [s.name for s in model.plant.design_states]
-    reason = out_of_reach(A, model.B, model.C, states)
-    if reason:
-        return reason
-    outputs = [s.name for s in model.plant.outputs]
-    summed = integrals_of(model, weights).outputs
-    if summed and _rank_at_rest(A, model.B, model.C[summed]) < len(A) + len(summed):
-        forces, names = " ".join(s.name for s in model.plant.inputs), " ".join(outputs[k] for k in summed)
-        return (
-            f"{forces} cannot hold {names} at rest, each at a reference of its own (a zero at s = 0): "
-            "weights.integral needs to be 0 of outputs that cannot be held beside the others"
-        )
-    if weights.drift_variance.size and _rank_at_rest(A, model.B, model.C) < len(A) + model.B.shape[1]:
-        return (
-            f"{' '.join(outputs)} do not tell the disturbances of the forces from each other at rest: "
-            "leave out noise.drift, and take integrals"
-        )
-    fastest = float(linalg.eigvals(A).real.max())
-    if fastest * Ts > LONG_SAMPLE_GROWTH:
-        return (
-            f"the sample time of {Ts:.4g} s is too long for the unstable pole at {fastest:.4g} rad/s, which grows "
-            f"{math.exp(min(fastest * Ts, 700)):.3g}-fold in it: at most about {0.3 / fastest:.1g} s"
-        )
-    return ""
-
-
-def out_of_reach(A: FloatArray, B: FloatArray, C: FloatArray, states: Sequence[str]) -> str:
-    """A mode that is not stable and that no input moves, or no output sees, in one sentence; "" without one."""
-    for mode in lost_modes(A, B):
-        return f"no force moves the mode {_mode_text(mode, states)}: a force that acts on it is missing"
-    for mode in lost_modes(A.T, C.T):
-        return f"no sensor sees the mode {_mode_text(mode, states)}: a measurement of it is missing"
-    return ""
-
-
-def _mode_text(mode: LostMode, states: Sequence[str]) -> str:
-    """Of a mode: its pole or frequency, and its states."""
-    size = abs(mode.pole)
-    kind = (
-        f"at {size:.4g} rad/s"
-        if mode.pole.imag or size < 1e-6
-        else f"with the pole {mode.pole.real:.4g} rad/s"
-    )
-    return f"{kind} of {' '.join(states[i] for i in mode.states)}, which is not stable"
-
-
-def _rank_at_rest(A: FloatArray, B: FloatArray, C: FloatArray) -> int:
-    """The rank of [A B; C 0], rows and columns scaled to 1."""
-    system = system_matrix(A, B, C)
-    for axis in (1, 0, 1):
-        size = np.linalg.norm(system, axis=axis, keepdims=True)
-        system = system / np.where(size > 0, size, 1.0)
-    return int(np.linalg.matrix_rank(system, tol=1e-10))
-
-
-@on_one_thread
-def lqr(model: Linear, weights: Weights, *, solver: Solver = "python-control") -> FloatArray:
-    """Design a continuous LQR: v = -K xi minimizes the integral of xi' Q xi + v' R v.
-
-    K = R^-1 B' P with 0 = A' P + P A + Q - P B R^-1 B' P. The same as control.lqr(A, B, Q, R)[0].
-
-    model : the linear model
-    weights : Q and R
-    solver : of the scaled equation: "python-control", or "scipy" without it, to the bit the same
-
-    Returns K, m x n.
-
-    Raises InputError for weights of another size, CheckError when the Riccati equation has no sound solution.
-
-    >>> import malta
-    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> weights = malta.synthesis.weights(q=[16, 0], r=[1], w=[1], v=[1])
-    >>> K = malta.synthesis.lqr(malta.linearize(cart, cart.at()), weights)
-    >>> K.round(6).tolist()  # w_n = 2 rad/s: K1 = w_n^2, K2 = sqrt(2) w_n
-    [[4.0, 2.828427]]
-    """
-    check_sizes(model, weights)
-    return care(model.A, model.B, weights.Q, weights.R, "LQR", solver=solver).K
-
-
-@on_one_thread
-def lqi(
-    model: Linear, weights: Weights, *, solver: Solver = "python-control"
-) -> tuple[FloatArray, FloatArray]:
-    """Design a continuous LQR with the integrals of the measured errors.
-
-        minimize integral of xi' Q xi + e' Q_i e + v' R v,    v = K (xi* - xi) + Ki e,   e' = p* - p
-
-    The Riccati gain on e acts as -K_e e, so Ki = -K_e. An output without a weight has no integral: its column is 0.
-    With a weight for each it is the same as control.lqr(A, B, diag(Q, Q_i), R, integral_action=C)[0] = [K, Ki].
-
-    model : the linear model
-    weights : Q, R and Q_i
-    solver : of the scaled equation: "python-control", or "scipy" without it, to the bit the same
-
-    Returns K (m x n) and Ki (m x p).
-
-    Raises InputError for weights of another size, CheckError when the Riccati equation has no sound solution.
-
-    >>> import malta
-    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> weights = malta.synthesis.weights([1, 0], [1], [1], [1], q_i=[4])
-    >>> K, Ki = malta.synthesis.lqi(malta.linearize(cart, cart.at()), weights)
-    >>> K.round(3).tolist(), Ki.round(3).tolist()
-    ([[3.375, 2.598]], [[2.0]])
-    """
-    check_sizes(model, weights)
-    summed, Q_i = integrals_of(model, weights)
-    n, k, Ki = len(model.A), len(summed), np.zeros((model.B.shape[1], len(model.C)))
-    if not summed:
-        return lqr(model, weights, solver=solver), Ki
-    A = system_matrix(model.A, None, -model.C[summed])
-    B = np.vstack([model.B, np.zeros((k, model.B.shape[1]))])
-    gain = care(A, B, linalg.block_diag(weights.Q, Q_i), weights.R, "LQI", solver=solver).K
-    Ki[:, summed] = -gain[:, n:]
-    return gain[:, :n], Ki
-
-
-class Integrals(NamedTuple):
-    """The outputs whose errors p* - p are integrated, and the weight of these integrals.
-
-    Those are the outputs with a weight; in the coordinates of the positions, C_q^-1 (p* - p), all outputs or none.
-    """
-
-    outputs: list[int]  # k indices
-    weight: FloatArray  # k x k
-
-
-def integrals_of(model: Linear, weights: Weights) -> Integrals:
-    """The integrals that the weights ask for."""
-    q_i = np.diag(weights.Q_i)
-    if weights.coordinates == "signals" or not q_i.any():
-        outputs = np.flatnonzero(q_i).tolist()
-        return Integrals(outputs, np.diag(q_i[outputs]))
-    to_positions = positions_from(model)
-    return Integrals(list(range(len(model.C))), np.asarray(to_positions.T @ weights.Q_i @ to_positions))
+from malta.synthesis.filters import Gains, Linear, kalman
+from malta.synthesis.reachability import obstacle
+from malta.synthesis.regulators import Integrals, check_sizes, integrals_of, lqi, lqr
+from malta.synthesis.riccati import Solver, dare
+from malta.synthesis.sampled_filters import sampled_filter
+from malta.synthesis.spec import Discretization
+from malta.synthesis.weighting import Weights
 
 
 def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexArray]:
@@ -414,61 +219,6 @@ def _require_lag(model: LinearModel, lag: float | None, discretization: Discreti
         raise InputError("lqg", "current_lag", found, expected)
 
 
-def weights(
-    q: ArrayLike, r: ArrayLike, w: ArrayLike, v: ArrayLike, *, q_i: ArrayLike | None = None
-) -> Weights:
-    """Make weights of a cost and variances of noise in SI units, without bases.
-
-    A vector or a diagonal matrix each.
-
-    q : n, of the states
-    r : m, of the inputs
-    w : m, variance of the forces held over a sample, N2
-    v : p, variance of a sample of the sensors
-    q_i : p, of the integrals of the errors; None: none
-
-    Returns a Weights.
-
-    Raises InputError for a matrix that is not diagonal, and for values below 0.
-
-    >>> import malta
-    >>> malta.synthesis.weights([1e8, 1e4], [1], [1e-2], [1e-12]).Q.tolist()
-    [[100000000.0, 0.0], [0.0, 10000.0]]
-    """
-    of_states, of_inputs, forces, sensors = (
-        _diagonal(name, value) for name, value in (("q", q), ("r", r), ("w", w), ("v", v))
-    )
-    integrals = np.zeros(len(sensors)) if q_i is None else _diagonal("q_i", q_i)
-    return _without_bases(of_states, of_inputs, integrals, forces, sensors, np.zeros(0))
-
-
-def _diagonal(name: str, value: ArrayLike) -> FloatArray:
-    found: FloatArray = np.atleast_1d(np.asarray(value, dtype=float))
-    if found.ndim == 1:
-        return found
-    if found.ndim != 2 or found.shape[0] != found.shape[1] or np.any(found - np.diag(np.diag(found))):
-        raise InputError(
-            "weights", name, f"shape {found.shape}, not diagonal", "a vector or a diagonal matrix"
-        )
-    return np.diag(found)
-
-
-def weights_of(controller: Controller) -> Weights:
-    """What an LQG was designed for, on bases of one SI unit. InputError for a PID, which was not."""
-    cost, noise = controller.cost, controller.noise
-    if cost is None or noise is None:
-        raise InputError(controller.name, "cost", "none, as a PID has", "an LQG")
-    found = _without_bases(cost.state, cost.input, cost.integral, noise.process, noise.sensor, noise.drift)
-    return replace(found, coordinates=cost.coordinates, correlation=noise.correlation)
-
-
-def _without_bases(
-    q: FloatArray, r: FloatArray, q_i: FloatArray, w: FloatArray, v: FloatArray, drift: FloatArray
-) -> Weights:
-    one = np.ones_like
-    return Weights(q, one(q), r, one(r), q_i, one(q_i), w, v, drift)
-
-
 def _backward_euler(
     model: Linear, weights: Weights, Ts: float, solver: Solver
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -541,28 +291,3 @@ def _split_cost(
     reached = np.hstack(sample(A, B, part * Ts))  # x when the newer one begins, of (x, stored)
     before = system_matrix(first[0], first[1], first[1].T, first[2])
     return before + reached.T @ last[0] @ reached, reached.T @ last[1], last[2]
-
-
-def check_sizes(model: Linear, weights: Weights) -> None:
-    """Raise InputError for weights and noise of other numbers than a model's states, inputs and outputs."""
-    n, m, p = len(model.A), model.B.shape[1], len(model.C)
-    half, in_positions = n // 2, weights.coordinates == "positions"
-    if in_positions:
-        positions_from(model)
-        if weights.q_i.any() and not weights.q_i.all():
-            found = f"{weights.q_i.tolist()} in coordinates of positions"
-            raise InputError("Weights", "q_i", found, "weights above 0 of all integrals, or of none")
-    integrals = ("q_i", "positions", half) if in_positions else ("q_i", "measured signals", p)
-    for field, what, size in (("q", "states", n), ("r", "inputs", m), integrals):
-        if len(getattr(weights, field)) != size:
-            raise InputError(
-                "Weights",
-                field,
-                f"{len(getattr(weights, field))} entries",
-                f"{size}, one for each of the {what}",
-            )
-    drifts = m if weights.drift_variance.size else 0
-    sources = half if in_positions else m
-    for field, size in (("process_variance", sources), ("sensor_variance", p), ("drift_variance", drifts)):
-        if len(getattr(weights, field)) != size:
-            raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}")

@@ -26,12 +26,12 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.model.parts import attribute_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.synthesis.controller import Controller
-from malta.synthesis.spec import Law as Law, Spec
 
 if TYPE_CHECKING:
-    from malta.synthesis.controller import Controller
     from malta.synthesis.filters import Linear
-    from malta.synthesis.recovery import RecoveryBound, StepResponse
+    from malta.synthesis.recovery import RecoveryBound
+    from malta.synthesis.spec import Law, Spec
+    from malta.synthesis.step_response import StepResponse
 
 Trade = Literal["force", "motion"]
 Form = Literal["number", "switch", "outputs", "inputs", "loads"]

@@ -51,18 +51,11 @@ from malta.synthesis import elements
 from malta.synthesis.controller import Controller
 from malta.synthesis.design_tables import ElementTable, GoalTable, StructureTable
 from malta.synthesis.elements import CALLER, Element, Parameter, Solve, keep_sign, side_by_side
-from malta.synthesis.lqg import weights
 from malta.synthesis.pid import axes_of
-from malta.synthesis.spec import (
-    PidAxes,
-    StructuredElement,
-    StructuredGoal,
-    StructuredLaw,
-    Weights,
-    pid_signals,
-)
+from malta.synthesis.spec import PidAxes, StructuredElement, StructuredGoal, StructuredLaw, pid_signals
 from malta.synthesis.state_space import law_of_errors
 from malta.synthesis.tunable_lqg import lqg
+from malta.synthesis.weighting import Weights, weights
 from malta.tables import Quantity
 from malta.units import to_si
 

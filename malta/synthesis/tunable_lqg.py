@@ -31,9 +31,10 @@ from malta.linear.system import System
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
-from malta.synthesis.lqg import check_sizes, out_of_reach
+from malta.synthesis.reachability import out_of_reach
+from malta.synthesis.regulators import check_sizes
 from malta.synthesis.riccati import RiccatiSolution, care
-from malta.synthesis.spec import Weights
+from malta.synthesis.weighting import Weights
 
 
 @on_one_thread

@@ -26,7 +26,8 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.peaks import largest_gain
 from malta.linear.sampling import add_lags, sample
-from malta.loops.classical import Nominal, last_crossover, tracked_band
+from malta.loops.bandwidths import last_crossover, tracked_band
+from malta.loops.classical import Nominal
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import SampledLoop, disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
@@ -48,9 +49,10 @@ from malta.synthesis.feedforward import current_loop_of, static_feedforward
 from malta.synthesis.filters import Gains, gain_at_rest
 from malta.synthesis.linear_law import LinearLaw, linear_law_of
 from malta.synthesis.lqg import gains
-from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.requirements import NoiseRms, Requirement, TrialFigures, requirements_for
-from malta.synthesis.spec import Spec, Weights
+from malta.synthesis.spec import Spec
+from malta.synthesis.step_response import StepResponse, step_response
+from malta.synthesis.weighting import Weights
 
 # The sampled machine at the corners of its box of parameters, and where each corner of the growing box is lost.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.peaks import smooth_peak
 from malta.linear.sampling import sample, sample_noise
-from malta.loops.classical import last_crossover, tracked_band
+from malta.loops.bandwidths import last_crossover, tracked_band
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import covariance
@@ -21,7 +22,9 @@ from malta.model.linearize import LinearModel, linearize
 from malta.model.places import position_at, position_in
 from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
-from malta.synthesis.spec import Loads, Spec
+
+if TYPE_CHECKING:
+    from malta.synthesis.spec import Loads, Spec
 
 
 @dataclass(frozen=True, eq=False)

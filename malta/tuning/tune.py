@@ -34,7 +34,8 @@ from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
 from malta.model.plant import Plant
 from malta.synthesis.requirements import Trade, base_of, ratio_of, requirements_for
-from malta.synthesis.spec import Spec, Weights
+from malta.synthesis.spec import Spec
+from malta.synthesis.weighting import Weights
 from malta.tuning import groups, pid
 from malta.tuning.groups import STEP, TuningGroup, figures_of, groups_of
 from malta.tuning.judging import judge

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from malta.arguments import by_name, is_pair
 from malta.errors import CheckError, InputError
@@ -19,7 +19,7 @@ from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
 from malta.loops.windings import CurrentLoops
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
-from malta.margins.scheduled_loops import schedule_rate
+from malta.margins.schedule_rates import schedule_rate
 from malta.margins.travel import LoopAlong
 from malta.margins.verify import linear_report, staged_report
 from malta.margins.worst_case import worst_sensitivities
@@ -34,10 +34,12 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-from malta.synthesis.recovery import RecoveryBound
 from malta.synthesis.requirements import Figure, NoiseRms, Requirement, base_of, requirements_for
-from malta.synthesis.spec import Spec
 from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
+
+if TYPE_CHECKING:
+    from malta.synthesis.recovery import RecoveryBound
+    from malta.synthesis.spec import Spec
 
 # What a design has of what it is asked for: requirements measured on its verified loop and simulated machine.
 

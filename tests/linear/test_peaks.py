@@ -11,16 +11,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from light_loops import Drawn, drawn_loop
 
-from malta.linear.peaks import (
-    Fall,
-    fall_frequencies,
-    gain_crossings,
-    in_plane,
-    of_plane,
-    part_of,
-    peak_gain,
-    phase_crossings,
-)
+from malta.linear.falls import Fall, fall_frequencies
+from malta.linear.peaks import gain_crossings, in_plane, of_plane, part_of, peak_gain, phase_crossings
 from malta.linear.system import System
 
 if TYPE_CHECKING:

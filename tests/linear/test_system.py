@@ -12,8 +12,10 @@ from hypothesis import given, settings, strategies as st
 from scipy import linalg
 
 import malta
-from malta.linear.interconnection import append, connect, feedback, gain, interconnect, lft, parallel, series
-from malta.linear.reduction import balanced_reduction, minimal
+from malta.linear.diagrams import feedback, interconnect, lft, parallel
+from malta.linear.interconnection import append, connect, gain, series
+from malta.linear.minimal import minimal
+from malta.linear.reduction import balanced_reduction
 from malta.linear.system import System
 
 W = 1j * np.geomspace(0.1, 30, 9)

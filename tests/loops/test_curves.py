@@ -18,7 +18,7 @@ from malta.loops.linear_loops import linear_loop
 from malta.loops.locus import root_locus, stability_changes
 from malta.loops.steps import loop_steps, step_figures
 from malta.simulation.references import Motion
-from malta.synthesis.recovery import StepResponse
+from malta.synthesis.step_response import StepResponse
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

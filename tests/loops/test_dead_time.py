@@ -17,9 +17,11 @@ from scipy import linalg
 
 import malta
 from malta.checker.check import check
+from malta.linear.closed_loops import closed_loop, instability
+from malta.linear.open_loops import open_systems, responses
 from malta.linear.sampling import sample, split_delay, stored_blocks
 from malta.linear.system import System
-from malta.linear.uncertain import Compensator, closed_loop, instability, open_systems, responses
+from malta.linear.uncertain import Compensator
 from malta.loops.sampled_loops import SampledLoop, machine_system
 from malta.model.sensors import Sensors
 from malta.proof.certificate import write_certificate

@@ -18,7 +18,7 @@ from magnets import MACHINES
 
 import malta
 from malta import gains
-from malta.linear.uncertain import closed_loop, instability
+from malta.linear.closed_loops import closed_loop, instability
 from malta.loops.sampled_loops import LOADS_LEFT_OUT, loaded_model, machine_loop, machine_system
 from malta.margins.travel import place_margin
 from malta.model.parameters import twins_of

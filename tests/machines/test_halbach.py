@@ -20,7 +20,7 @@ from malta.machines.halbach import electronics, electronics as motor, plant as h
 from malta.machines.halbach.parameters import GAP, Parameters
 from malta.model.data import published_value
 from malta.model.parameters import values_of
-from malta.synthesis.filters import sampled_model
+from malta.synthesis.design_models import sampled_model
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -45,7 +45,7 @@ from malta.simulation.experiments.catalogue import cases_of, experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import sampled_model
+from malta.synthesis.design_models import sampled_model
 from malta.synthesis.linear_law import linear_law
 
 if TYPE_CHECKING:

@@ -20,21 +20,23 @@ import malta
 from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
+from malta.linear.closed_loops import closed_loop, instability
+from malta.linear.open_loops import responses
 from malta.linear.system import System
-from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
-from malta.loops.classical import (
-    Nominal,
-    balanced_norm,
-    classical_margins,
-    delay_margins,
-    disk_margins_alone,
-    nominal_loop,
-)
-from malta.loops.parametric_plants import uncertain
+from malta.linear.uncertain import Compensator, UncertainSystem
+from malta.loops.classical import Nominal, balanced_norm, classical_margins, delay_margins, disk_margins_alone
 from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
+from malta.loops.uncertain_models import uncertain
 from malta.margins.loop_report import LoopReport
 from malta.margins.travel import place_margin
-from malta.margins.verify import MACHINE_STAGE, SAMPLED_STAGE, compensators, linear_report, staged_report
+from malta.margins.verify import (
+    MACHINE_STAGE,
+    SAMPLED_STAGE,
+    compensators,
+    linear_report,
+    nominal_loop,
+    staged_report,
+)
 from malta.model.linearize import linearize
 from malta.model.plants import plant_of
 from malta.proof.blocks.gain import Gain

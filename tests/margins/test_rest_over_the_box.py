@@ -14,7 +14,7 @@ from magnets import MACHINES
 from scipy.linalg import expm
 
 import malta
-from malta.linear.uncertain import closed_loop
+from malta.linear.closed_loops import closed_loop
 from malta.loops.sampled_loops import machine_system
 from malta.model import Actuator, Plant, Sensors, Signal, check_parameters, si
 from malta.proof.box import box_of, within_branches

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.linear.uncertain import instability
+from malta.linear.closed_loops import instability
 from malta.loops.sampled_loops import machine_system
 from malta.model import Actuator, Plant, Sensors, Signal, check_parameters, si
 

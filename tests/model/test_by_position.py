@@ -16,9 +16,12 @@ from malta import gains
 from malta.errors import InputError
 from malta.linear.sampling import sample, sample_noise
 from malta.loops.sampled_loops import machine_loop
-from malta.synthesis.filters import kalman, positions_from, sampled_filter
-from malta.synthesis.lqg import integrals_of, lqg, lqi, weights_of
-from malta.synthesis.spec import Spec, Weights
+from malta.synthesis.filters import kalman, positions_from
+from malta.synthesis.lqg import lqg
+from malta.synthesis.regulators import integrals_of, lqi
+from malta.synthesis.sampled_filters import sampled_filter
+from malta.synthesis.spec import Spec
+from malta.synthesis.weighting import Weights, weights_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,10 +20,12 @@ from malta.linear.sampling import delay_inputs, sample, sample_cost
 from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import with_lags
-from malta.synthesis.lqg import gains, integrals_of, lqg, weights
+from malta.synthesis.design_models import with_lags
+from malta.synthesis.lqg import gains, lqg
+from malta.synthesis.regulators import integrals_of
 from malta.synthesis.separation import controller_poles
 from malta.synthesis.spec import Spec
+from malta.synthesis.weighting import weights
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 import malta
-from malta.linear.uncertain import instability
+from malta.linear.closed_loops import instability
 from malta.loops.sampled_loops import machine_loop, machine_system
 from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin

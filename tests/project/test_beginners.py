@@ -15,7 +15,7 @@ import malta
 from malta.cli import main as cli
 from malta.files import shipped_path
 from malta.model import machines
-from malta.synthesis.lqg import lost_modes
+from malta.synthesis.reachability import lost_modes
 
 F = "f=lambda x, u, w: ca.vertcat(x[1], (u + w) / par.m)"
 FORCES = "forces=lambda x, i: pull(par, x[0], i)"

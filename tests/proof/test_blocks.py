@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.errors import InputError
-from malta.linear.uncertain import responses
+from malta.linear.open_loops import responses
 from malta.proof import Dynamic
 from malta.proof.blocks import Block, probe, weight_of
 from malta.proof.blocks.transfer import LoopSignals, mu_bound, performance, transfer

@@ -14,8 +14,8 @@ import pytest
 
 import malta
 from malta.linear.branches import MAX_CASES, branch_cases
+from malta.linear.closed_loops import instability
 from malta.linear.compensators import compensator_of
-from malta.linear.uncertain import instability
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,7 +13,7 @@ from published_cases import ROBSTAB, Loop, pid
 import malta
 from malta import dynamic_margin, gains
 from malta.errors import InputError
-from malta.linear.uncertain import responses
+from malta.linear.open_loops import responses
 from malta.margins.travel import travel_loops
 from malta.model.plants import plant_of
 from malta.proof import Dynamic

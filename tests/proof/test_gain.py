@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 import malta
 from malta import gains
 from malta.errors import InputError
-from malta.linear.uncertain import responses
+from malta.linear.open_loops import responses
 from malta.margins.travel import travel_loops
 from malta.margins.worst_case import worst_sensitivities
 from malta.model.plants import plant_of

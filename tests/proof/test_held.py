@@ -14,11 +14,13 @@ from scipy import linalg
 
 import malta
 from malta import gains
+from malta.linear.closed_loops import closed_loop
+from malta.linear.open_loops import responses
 from malta.linear.sampling import sample
-from malta.linear.uncertain import UncertainSystem, closed_loop, responses
+from malta.linear.uncertain import UncertainSystem
 from malta.loops.own_model import unstable_gain
-from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
+from malta.loops.uncertain_models import uncertain
 from malta.loops.windings import left_out
 from malta.margins.travel import travel_margin
 from malta.margins.verify import linear_report
@@ -29,12 +31,13 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import between_samples, sampled_model
+from malta.synthesis.design_models import between_samples, sampled_model
 from malta.synthesis.linear_law import linear_law
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.separation import controller_poles
-from malta.synthesis.spec import Pid, Weights
+from malta.synthesis.spec import Pid
+from malta.synthesis.weighting import Weights
 
 ROOT = Path(__file__).parents[2]
 

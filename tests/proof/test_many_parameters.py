@@ -14,7 +14,8 @@ import pytest
 from scipy import linalg
 
 import malta
-from malta.linear.uncertain import Compensator, UncertainSystem, instability
+from malta.linear.closed_loops import instability
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.box import Box, box_of
 from malta.proof.multipliers import BlockSizes, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import LEVELS, gains_of_level

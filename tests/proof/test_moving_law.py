@@ -13,8 +13,9 @@ from scipy import linalg
 import malta
 from malta.linear.compensators import compensator_of
 from malta.linear.uncertain import Compensator
-from malta.margins import schedule_rate, scheduled_loops
-from malta.margins.scheduled_loops import loops_between_places, rate_of_cells
+from malta.margins import schedule_rate, schedule_rates
+from malta.margins.schedule_rates import rate_of_cells
+from malta.margins.scheduled_loops import loops_between_places
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import BITS, middle
 
@@ -79,7 +80,7 @@ def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any])
     cells = loops_between_places(*magnet, (), "lag")
     assert not isinstance(cells, str)
     with precision(BITS):
-        for cell in scheduled_loops._cells_of(cells):
+        for cell in schedule_rates._cells_of(cells):
             p, h = (cell.low + cell.high) / 2, 1e-5
             below, here, above = (middle(cell.at(p + d)) for d in (-h, 0.0, h))
             second, _ = cell.curvature(arb(p, h))
@@ -101,7 +102,7 @@ def test_courses_as_fast_as_proven_decay(magnet: tuple[Any, Any]) -> None:
     cells = loops_between_places(*magnet, (), "lag")
     assert not isinstance(cells, str)
     T, rng, steps, p, way = magnet[1].sample_time, np.random.default_rng(2), 4, 0.0, bound.rate
-    functions = [scheduled_loops._expressions(*cell[:2], None) for cell in cells]
+    functions = [schedule_rates._expressions(*cell[:2], None) for cell in cells]
     n = functions[0][2]
     whole = np.eye(functions[0][0].size1_out(1))
     for _ in range(600):

@@ -16,9 +16,11 @@ from hypothesis import assume, given, settings, strategies as st
 
 from malta import gains
 from malta.errors import InputError
-from malta.linear.uncertain import Compensator, UncertainSystem, critical_frequency, instability, responses
-from malta.loops.parametric_plants import uncertain
+from malta.linear.closed_loops import critical_frequency, instability
+from malta.linear.open_loops import responses
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import machine_law, machine_system
+from malta.loops.uncertain_models import uncertain
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators
 from malta.model.plants import plant_of

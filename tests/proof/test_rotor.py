@@ -19,7 +19,7 @@ from conftest import ROOT, printed
 import malta
 from malta import report
 from malta.campaigns.result import figures_of
-from malta.linear.uncertain import instability
+from malta.linear.closed_loops import instability
 from malta.margins.loop_report import LoopReport, zone
 from malta.margins.travel import NO_EXTENT, Extent, extent_of, positions_of, travel_loops, travel_margin
 from malta.model import machines

@@ -11,7 +11,7 @@ from along_travel import at_place
 from exported import controller
 
 import malta
-from malta.linear.uncertain import closed_loop, instability
+from malta.linear.closed_loops import closed_loop, instability
 from malta.loops.sampled_loops import machine_system
 from malta.margins.travel import travel_loops
 from malta.margins.tuned_gains import MAX_SCATTER, GainBox, gain_box, tuned_loop

@@ -10,9 +10,10 @@ import pytest
 
 import malta
 from malta.errors import InputError
-from malta.linear.uncertain import closed_loop, critical_frequency, instability, responses
-from malta.loops.parametric_plants import uncertain
+from malta.linear.closed_loops import closed_loop, critical_frequency, instability
+from malta.linear.open_loops import responses
 from malta.loops.sampled_loops import machine_law, sampled_loop
+from malta.loops.uncertain_models import uncertain
 from malta.proof.robust import robust_margin
 
 if TYPE_CHECKING:

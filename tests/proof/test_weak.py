@@ -16,8 +16,8 @@ from flint import arb
 from scipy import linalg
 
 from malta import gains
+from malta.linear.closed_loops import closed_loop, instability
 from malta.linear.expressions import NotAnalytic, program
-from malta.linear.uncertain import closed_loop, instability
 from malta.loops.parametric_plants import model_of
 from malta.margins.travel import NOT_BETWEEN_TEXT, LoopAlong, margin_anywhere, travel_margin
 from malta.model.plants import plant_of

@@ -33,7 +33,7 @@ from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import ESTIMATORS, Fault, Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, Verdict
-from malta.synthesis.lqg import lqr
+from malta.synthesis.regulators import lqr
 
 if TYPE_CHECKING:
     from conftest import Design

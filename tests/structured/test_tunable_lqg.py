@@ -13,7 +13,7 @@ import malta
 from malta import structured
 from malta.structured.loops import models_of_systems
 from malta.synthesis import weights
-from malta.synthesis.lqg import integrals_of
+from malta.synthesis.regulators import integrals_of
 from malta.synthesis.structure import Structure, places_of
 
 BODY = [[0.0, 1.0], [100.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]]

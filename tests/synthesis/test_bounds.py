@@ -20,7 +20,8 @@ from tampering import claiming
 
 import malta
 from malta.checker import check, file as checked_file, loop as checked_loop
-from malta.linear.uncertain import Compensator, closed_loop
+from malta.linear.closed_loops import closed_loop
+from malta.linear.uncertain import Compensator
 from malta.margins.loop_report import StagePeak
 from malta.margins.travel import smallest_margin
 from malta.proof import certificate, exclusion

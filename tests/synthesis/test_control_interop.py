@@ -22,7 +22,7 @@ from malta.gains import encodings
 from malta.loops.sampled_loops import machine_loop
 from malta.model.fingerprint import fingerprint
 from malta.simulation.experiments.catalogue import jump
-from malta.synthesis import filters, lqg, riccati
+from malta.synthesis import filters, lqg, regulators, riccati, sampled_filters
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -75,11 +75,11 @@ def shipped(request: pytest.FixtureRequest) -> Design:
 
     with pytest.MonkeyPatch.context() as patch:
         for name in asked:
-            patch.setattr(lqg, name, partial(noted, name))
-            patch.setattr(filters, name, partial(noted, name))
+            for module in (lqg, regulators, filters, sampled_filters):
+                patch.setattr(module, name, partial(noted, name), raising=False)
         weights = replace(spec.weights, correlation=np.zeros(0))  # which python-control does not know
-        lqg.lqr(model, weights)
-        lqg.kalman(model, weights)
+        regulators.lqr(model, weights)
+        filters.kalman(model, weights)
         lqg.gains(model, weights, spec.sample_time, "sampled-data", spec.delay)
     return Design(model, weights, asked["care"], asked["dare"])
 
@@ -95,7 +95,7 @@ def test_control_lqr_gives_the_continuous_gains(shipped: Design) -> None:
     K = control.lqr(m.A, m.B, w.Q, w.R, method="scipy")[0]
     assert apart(K, malta.synthesis.lqr(m, w)) < 1e-9
     if w.q_i.any():
-        Q = linalg.block_diag(w.Q, lqg.integrals_of(m, w).weight)
+        Q = linalg.block_diag(w.Q, regulators.integrals_of(m, w).weight)
         K = control.lqr(m.A, m.B, Q, w.R, integral_action=m.C, method="scipy")[0]
         p, n = m.C.shape
         A = np.block([[m.A, np.zeros((n, p))], [m.C, np.zeros((p, p))]])

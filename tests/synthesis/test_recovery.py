@@ -19,7 +19,7 @@ from malta.model.linearize import linearize
 from malta.report.figures.margins import recovery_figure
 from malta.report.tables.design import recovery_table
 from malta.simulation import experiments as responses
-from malta.synthesis.recovery import step_response
+from malta.synthesis.step_response import step_response
 
 if TYPE_CHECKING:
     from conftest import Run

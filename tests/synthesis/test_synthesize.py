@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import malta
+from malta.synthesis.design_models import sampled_model
 from malta.synthesis.feedforward import pi_current_loop, static_feedforward
-from malta.synthesis.filters import sampled_model
 from malta.synthesis.separation import controller_poles
 
 if TYPE_CHECKING:

@@ -13,12 +13,12 @@ from pydantic import Field
 from malta.cli.documents.loops import DocumentPart, Files, Number
 
 if TYPE_CHECKING:
-    from malta.loops.classical import ChannelMargins
+    from malta.loops.channel_margins import ChannelMargins
     from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place
     from malta.loops.locus import RootLocus
     from malta.margins.margin_map import MarginMap
-    from malta.synthesis.recovery import StepResponse
+    from malta.synthesis.step_response import StepResponse
 
 Line = Annotated[list[Number], Field(description="one number for each frequency, time or value")]
 Poles = Annotated[list[list[float]], Field(description="rows of real and imaginary part")]

@@ -30,7 +30,7 @@ from malta.model.linearize import LinearModel
 from malta.report.ledger import Row, case_merit, machine_share, merit, peak_sensitivity, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import sampled_model
+from malta.synthesis.design_models import sampled_model
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:

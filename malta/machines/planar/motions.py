@@ -32,7 +32,8 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
-from malta.synthesis.lqg import lqg, weights_of
+from malta.synthesis.lqg import lqg
+from malta.synthesis.weighting import weights_of
 
 MODELS = ("exact", "table", "analytical")  # coil models of the controller
 PLACE = (6e-3, 4e-3)  # m, x and y of a place without symmetry; the paper does not print its own

@@ -18,7 +18,6 @@ from malta.synthesis.requirements import (
     SEEDS,
     Design,
     Figure,
-    Law,
     Requirement,
     TrialFigures,
     force_noise_of,
@@ -27,6 +26,7 @@ from malta.synthesis.requirements import (
     reached_with_every_seed,
     worst_merit,
 )
+from malta.synthesis.spec import Law
 
 DRIVE = "K_D"  # the force constant of the drive, which scales the thrust and no other force
 DRIVE_ERROR = 0.05  # of the drive's force constant, in the strokes of tracking_error

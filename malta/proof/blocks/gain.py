@@ -21,7 +21,8 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
 from malta.errors import InputError
-from malta.linear.uncertain import Compensator, UncertainSystem, responses
+from malta.linear.open_loops import responses
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
 from malta.proof.blocks import (
     At,

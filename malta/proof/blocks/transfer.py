@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray, readonly
-from malta.linear.uncertain import ResponseMatrices
+from malta.linear.open_loops import ResponseMatrices
 from malta.proof.blocks import Block
 from malta.work import is_past
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
     from malta.synthesis.controller import Controller
-    from malta.synthesis.recovery import StepResponse
+    from malta.synthesis.step_response import StepResponse
     from malta.tuning.tune import TuningResult
 
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine

@@ -25,15 +25,8 @@ from malta.model.plants import plant_of
 from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import Experiment, progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
-from malta.synthesis.spec import (
-    Pid,
-    Spec,
-    StructuredLaw,
-    Weights,
-    integral_signals,
-    pid_signals,
-    process_signals,
-)
+from malta.synthesis.spec import Pid, Spec, StructuredLaw, integral_signals, pid_signals, process_signals
+from malta.synthesis.weighting import Weights
 from malta.tuning.verify import verify, with_requirements
 from malta.units import FINE_UNITS, identifier, in_unit
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.arrays import FloatArray
-    from malta.loops.classical import ChannelMargins
+    from malta.loops.channel_margins import ChannelMargins
     from malta.loops.linear_loops import Place
 
 ONE_LOOP = "one loop at a time, the others closed"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Transform
 
     from malta.arrays import ComplexArray, FloatArray
-    from malta.loops.classical import ChannelMargins
+    from malta.loops.channel_margins import ChannelMargins
     from malta.loops.linear_loops import Place
 
 LINE = 0.155  # inch, of text above a panel

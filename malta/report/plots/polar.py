@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray
     from malta.campaigns.result import Campaign
     from malta.campaigns.summary import Summary
-    from malta.loops.classical import ChannelMargins
+    from malta.loops.channel_margins import ChannelMargins
     from malta.loops.linear_loops import Place
 
 MAX_LEFT_REACH = 4.0  # how far left of the origin a Nyquist plot reaches at most

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.loops.curves import LoopCurves
-    from malta.synthesis.recovery import StepResponse
+    from malta.synthesis.step_response import StepResponse
 
 SHOWN_TIME_FACTOR = 1.6  # times the longest settling time
 MAX_TIME_FACTOR = 60.0  # times the shortest rise or time to the peak

@@ -43,7 +43,7 @@ from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import static_feedforward
-from malta.synthesis.lqg import lqr
+from malta.synthesis.regulators import lqr
 from malta.synthesis.spec import Spec
 from malta.synthesis.tunable_lqg import calibrate
 

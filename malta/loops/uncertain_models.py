@@ -1,0 +1,42 @@
+"""A linear system in parameters by name, of a machine or of whatever a user has: `malta.uncertain`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from malta.errors import require_known
+from malta.linear.systems import from_source
+from malta.linear.uncertain import UncertainSystem
+from malta.loops.parametric_plants import of_plant
+from malta.model.plant import Plant
+
+
+def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
+    """Make a linear system that depends on parameters by name.
+
+        E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u
+
+    source : a Plant, which is linearized with these parameters; a function of the parameters by name (or of one array
+        p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a casadi.Function of p; or
+        matrices A0, B0, C0[, D0[, E0]]
+    names : of a Plant the names of its parameters; else their nominal values by name, SI
+    options : of a Plant `x`, the states to linearize at; of the others `terms`, the factors of each parameter beside
+        matrices, as {"k": (A1, B1, C1)}; `limits` (above, below) of parameters; `sample_time` (s) of matrices that give
+        x+ in place of x'
+
+    Returns an UncertainSystem.
+
+    Raises InputError for unknown options, and for names, shapes and values that do not fit.
+
+    >>> import malta
+    >>> def motor(J, b):
+    ...     return [[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]
+    >>> system = malta.uncertain(motor, {"J": 2e-3, "b": 0.1})
+    >>> system.names
+    ('J', 'b')
+    """
+    made = of_plant if isinstance(source, Plant) else from_source
+    known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
+    require_known(options, known, "uncertain", found="an unknown option")
+    return made(source, names, **options)
