@@ -12,7 +12,7 @@ from published_cases import CASES, Loop, Polynomial
 from timing import Result, medians, optional
 
 import malta
-from malta.loops.sampled_loops import machine_law
+from malta.loops.sampled_laws import machine_law
 from malta.margins.travel import travel_margin
 from malta.proof.robust import problem_of
 

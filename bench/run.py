@@ -44,7 +44,7 @@ from malta.machines.planar import commutation, field, plant as planar
 from malta.machines.planar.experiments import compile_function
 from malta.machines.planar.motions import CELLS
 from malta.machines.tubular import plant as tubular
-from malta.model.data import published_value
+from malta.model.printed import published_value
 from malta.simulation.engine.engines import engine_of, library_of
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference

@@ -27,7 +27,7 @@ from malta.cli import main as cli
 from malta.firmware import cost
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.machines.tubular import plant as tubular
-from malta.model.data import read_published
+from malta.model.printed import read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
 from malta.proof.problem import OfLoop, OfSeveral, Problem

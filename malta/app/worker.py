@@ -42,10 +42,10 @@ from malta.proof.loss import ray_bound
 from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import base_of, judge_figure, proven_margin, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Variable
+from malta.tuning.outcomes import SynthesizedDesign, outcomes_of
 from malta.tuning.pid import BOUND_COST, MIN_BOUND_RATIO, ROOM, load_error, name_of, search_gains
 from malta.tuning.search import Effort, Journal, Progress, Trial, apply_trial, at_least_of
 from malta.tuning.tune import cluster_search, clusters_of, frugal_trials, search_weights
-from malta.tuning.verify import SynthesizedDesign, outcomes_of
 from malta.work import count_work
 
 # Trials for each number, of one search after the other: the page's own, then better ones.

@@ -17,8 +17,8 @@ from malta.campaigns.plan import Plan, half_width, varied_names
 from malta.campaigns.store import RunBlock, figure_shapes
 from malta.display import Description, display
 from malta.merits import Merit
-from malta.model.data import published_value
 from malta.model.parameters import differences, units_of
+from malta.model.printed import published_value
 from malta.model.signal_groups import inputs_of, outputs_of, stroke_unit
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting

@@ -143,8 +143,8 @@ def _measure(
     from malta.identification.data_file import read_identified
     from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
-    from malta.model.data import published_figures
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
 
     read = [read_log(log) for log in logs]
     if identified is None:

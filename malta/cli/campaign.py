@@ -87,8 +87,8 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
     from malta.campaigns.run import status as status_of
     from malta.campaigns.store import noted_gains
     from malta.campaigns.summary import RunLimits
-    from malta.model.data import published_figures
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
 
     sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
     given = [param for param, source in sources.items() if source and source.name == "COMMANDLINE"]
@@ -446,8 +446,8 @@ def campaign(
     from malta.campaigns.plan import Plan
     from malta.campaigns.run import RunExecution, campaign_folder, summarize
     from malta.campaigns.summary import RunLimits
-    from malta.model.data import published_figures
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
     from malta.simulation.experiments.catalogue import main_job, settling_option
 
     controller = read_controller(gains, machine)

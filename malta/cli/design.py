@@ -125,8 +125,8 @@ def _run_design(
     from malta import gains, report
     from malta.gains.writing import require_stable
     from malta.margins.verify import linear_report
-    from malta.model.data import published_beside
     from malta.model.linearize import linearize
+    from malta.model.printed import published_beside
     from malta.simulation.experiments.catalogue import main_job
     from malta.synthesis.synthesize import synthesize
 
@@ -432,7 +432,7 @@ def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> Tuni
 def _write(spec: Spec, tuned: TuningResult, target: Path) -> list[Path]:
     """Write the design file that was found; beside it the Pareto front where there is one."""
     from malta import report
-    from malta.tuning.tune import design_text
+    from malta.tuning.design_text import design_text
 
     files = {target: design_text(spec, tuned.trial, target).encode()}
     if not tuned.front:

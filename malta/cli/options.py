@@ -125,9 +125,9 @@ def read_shares(
     Raises InputError for two shares for all, and as `read_assignments` does.
     """
     from malta.campaigns.plan import box_of
-    from malta.model.data import published_figures
     from malta.model.parameters import differences, units_of
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
 
     named = [text for text in texts or () if "=" in text]
     general = [text for text in texts or () if "=" not in text]

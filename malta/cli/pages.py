@@ -152,7 +152,8 @@ def motion(
     from malta.gains.file import content_of
     from malta.model.plants import plant_of
     from malta.report.page.motion import motion_gif, motion_of, motion_page, read_motion
-    from malta.simulation.experiments.catalogue import experiment, witness_flights
+    from malta.simulation.experiments.catalogue import experiment
+    from malta.simulation.experiments.witness import witness_flights
 
     controller = read_controller(gains, machine)
     if not (run or scenario or witness):
@@ -258,7 +259,7 @@ def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], 
 
     A campaign or an experiment that is cut short hands over what it has, of which a paper's figures cannot be made.
     """
-    from malta.model.data import read_published
+    from malta.model.printed import read_published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 

@@ -155,8 +155,8 @@ def campaigns_of(
         return []
     from malta.campaigns.run import status
     from malta.campaigns.summary import RunLimits
-    from malta.model.data import published_figures
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
 
     bounds = RunLimits(published_figures(plant_of(controller.parameters).name), spec)
     found = []

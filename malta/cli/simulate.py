@@ -169,8 +169,8 @@ def simulate(
     \b
     Example:  malta simulate design/gains/calibrated.json --set m=0.56 --out build
     """
-    from malta.model.data import published_figures
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
     from malta.simulation.experiments.catalogue import experiment, main_job
 
     controller = read_controller(gains, machine)

@@ -103,8 +103,8 @@ def verify(
     """
     from malta.cli.report import campaigns_of
     from malta.gains.writing import require_stable
-    from malta.model.data import published_figures
     from malta.model.plants import plant_of
+    from malta.model.printed import published_figures
     from malta.tuning.verify import verify as verify_loop
 
     controller = read_controller(gains, machine)

@@ -36,13 +36,12 @@ from malta.gains.stable import read_stable
 from malta.gains.writing import UNCOMPARED_TABLES
 from malta.linear.expressions import NotAnalytic, exact
 from malta.linear.uncertain import Compensator, UncertainSystem
-from malta.loops.sampled_loops import LAST_STAGE
-from malta.loops.windings import CurrentLoops, chosen_loops
+from malta.loops.windings import LAST_STAGE, CurrentLoops, chosen_loops
 from malta.margins.travel import ENDS, extent_of, travel_loops
-from malta.model.data import published_figures
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
+from malta.model.printed import published_figures
 from malta.proof.box import box_of, sides_of
 from malta.proof.certificate import DERIVED_UNIT, LoopOrigin, loops_of, refused_as_input
 from malta.proof.margin import Ranges

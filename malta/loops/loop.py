@@ -19,18 +19,17 @@ from malta.errors import InputError, require_known
 from malta.linear.matrices import eigenvalues
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Classical, Nominal, classical_margins
+from malta.loops.parametric_loops import machine_system
 from malta.loops.sampled_loops import (
-    LAST_STAGE,
     SampledLoop,
     continuous_poles,
     disturbance_map,
     loaded_loop,
     loaded_model,
     machine_loop,
-    machine_system,
     push_through,
 )
-from malta.loops.windings import CurrentLoops, chosen_loops, left_out
+from malta.loops.windings import LAST_STAGE, CurrentLoops, chosen_loops, left_out
 from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
 from malta.model.places import position_at

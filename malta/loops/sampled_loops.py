@@ -1,4 +1,4 @@
-"""The loop of a machine and a controller as a proof has it: sampled, with its delay, current loops and late sensors.
+"""The loop of a machine and a controller in numbers: sampled, with its delay, current loops and late sensors.
 
 P is the machine from forces to measurements under a zero-order hold, exactly; F is the control law from measurements
 to forces (v = F y), as in the block diagram of synthesis/controller.py. At the sensors
@@ -12,141 +12,48 @@ reading is a further input of P, and F passes it on.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
-from malta.errors import CheckError
 from malta.linear.matrices import eigenvalues, system_matrix
 from malta.linear.peaks import in_plane, response_at
-from malta.linear.sampling import add_lags, sample, whole_or_not
+from malta.linear.sampling import add_lags, sample
 from malta.linear.system import System
-from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
-from malta.loops.feedforward_along import along_stroke, slopes_along
-from malta.loops.parametric_plants import held_gain, is_dear, of_plant
 from malta.loops.windings import (
+    LAST_STAGE,
     Caught,
     CurrentControl,
     CurrentLoops,
     axis_map,
     chosen_loops,
     current_control,
-    force_modes,
     forecast_as_forces,
     link_at_rest,
     sample_driven,
     windings_of,
-    with_current_control,
     with_estimated_emf,
     with_windings,
 )
-from malta.model.currents import is_commutated
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
 from malta.model.places import off_stroke, position_at, position_in
-from malta.model.plant import OperatingPoint, Plant, whole_samples
+from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.model.sensors import split_dead_time, with_lags
 from malta.model.traced import trace
 from malta.synthesis.controller import Controller
 from malta.synthesis.law import law_at
-from malta.synthesis.linear_law import LinearLaw, linear_law, with_forces_read, with_readings, with_slope
+from malta.synthesis.linear_law import LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.step_response import StepResponse, step_response
 
-# The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
-
-
-class ReadingUse(NamedTuple):
-    """What a reading y does besides entering the control law."""
-
-    held: FloatArray | None = None  # the gain H of held currents: v + H y acts
-    handed: bool = False  # whether y is a further input of the system
-    slope: FloatArray | None = None  # dv0/dy, m x p: v0 follows the reading; None: it stands still
-    moved: tuple[int, ...] = ()  # forces whose v0 is read behind the outputs, see feedforward_along.py
-
-
-def sampled_law(
-    controller: Controller,
-    delay: float,
-    lag: float,
-    control: CurrentControl | None = None,
-    *,
-    late: int = 0,
-    use: ReadingUse | None = None,
-) -> Compensator:
-    """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
-
-    lag : rad/s, crossover of the current loops, as first-order lags; without effect where there is a `control`
-    control : PI controllers of the currents, which also read phi (windings.py)
-    late : samples by which these and the law read y late, where there is a `control`
-    """
-    law, T = linear_law(controller), controller.sample_time
-    held, handed, slope, moved = use or ReadingUse()
-    if slope is not None:
-        law = with_slope(law, slope)
-    if moved:
-        law = with_forces_read(law, moved, len(controller.forces))
-    if control is not None:
-        law = with_estimated_emf(law, control.emf)
-    n, m = len(controller.states), len(controller.forces)
-    half = plant_of(controller.parameters).coordinates
-    p = len(controller.summed)
-    # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
-    to_modes = np.eye(len(law.A))
-    if controller.tracks == "states" and len(controller.measurements) == m == half:
-        if p == m:
-            to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
-        for k in range(2 * half, n, m):
-            to_modes[k : k + m, k : k + m] = controller.B[half:]
-    back = np.linalg.inv(to_modes)
-    law = law._replace(A=to_modes @ law.A @ back, B_y=to_modes @ law.B_y, C=law.C @ back)
-    if controller.observed:
-        summed = _integrals_last(law, m)
-        law, p = (law, 0) if summed is None else (summed, m)
-    if held is not None:
-        law = law._replace(D_y=law.D_y + _pad(held, law.D_y.shape[1]))
-    if handed:
-        law = with_readings(law, len(controller.measurements))
-    c = Compensator(
-        law.A, law.B_y, law.C, law.D_y,
-        integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,
-    )  # fmt: skip
-    return c if control is None else with_current_control(c, control, late)
-
-
-def _integrals_last(law: LinearLaw, count: int) -> LinearLaw | None:
-    """Transform a law that cancels observed disturbances d: its last states d + X xi become plain sums of the readings.
-
-    With A = [[M, N], [G, 1]], X solves X (M - 1) = -G. Then X N = 0, because the law leaves no constant disturbance.
-    None for a law that leaves one, as with rounded coefficients: its states are no sums, and stay as they are.
-    """
-    A, k = law.A, len(law.A) - count
-    try:
-        X = -np.linalg.solve((A[:k, :k] - np.eye(k)).T, A[k:, :k].T).T
-    except np.linalg.LinAlgError as error:
-        raise CheckError("the law sums errors beside the disturbances that it observes") from error
-    left, size = np.abs(X @ A[:k, k:]).max(), (np.abs(X) @ np.abs(A[:k, k:])).max()
-    if not left <= 1e-8 * size:
-        return None
-
-    def summed(M: FloatArray) -> FloatArray:
-        return np.vstack([M[:k], M[k:] + X @ M[:k]])
-
-    T = np.eye(len(A))
-    T[k:, :k] = -X
-    A = summed(A) @ T
-    A[k:] = np.eye(len(A))[k:]
-    return law._replace(A=A, B_y=summed(law.B_y), B_r=summed(law.B_r), C=law.C @ T)
-
-
-LAST_STAGE: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 ROUNDING = 1e-9  # of the largest entry
 RESONANCE_OFFSETS = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])  # half-widths of a resonance
 DELAY_POLE_SIZE = 1e-6  # |z| below which a pole is one of pure delay
@@ -287,16 +194,16 @@ def sampled_loop(
             A, B = add_lags(A, B, plant.actuator.crossover)
         Ts = controller.sample_time
         Ad, Bd = sample(A, B, Ts, delay) if caught is None else caught.add_to((A, B), Ts, delay)
-    Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
+    Cd, true = pad(C, len(Ad)), None if true is None else pad(true, len(Ad))
     first = len(Ad) - len(C) - (len(controller.forces) if current_loops == "pi" else 0)
     if caught is not None:
         Cd = np.eye(len(Ad))[first : first + len(C)]
     if late:
         Ad, Bd, Cd = _stored_readings(Ad, Bd, Cd, late)
-        true = None if true is None else _pad(true, len(Ad))
+        true = None if true is None else pad(true, len(Ad))
     if model.E.any():
         law = with_readings(law)
-    at = None if caught is None else (first, caught._replace(C=_pad(C, len(continuous))))
+    at = None if caught is None else (first, caught._replace(C=pad(C, len(continuous))))
     return SampledLoop(Ad, Bd, Cd, law, controller.sample_time, true, continuous, caught=at)
 
 
@@ -332,9 +239,9 @@ def _sample_windings(
     link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
     if link is not None:
         A = system_matrix(A, B @ link.share[:, None], (link.by_phi @ phi)[None], np.array([[link.rate]]))
-        B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
+        B, phi, share = np.vstack([B, link.by_w[None]]), pad(phi, len(A)), link.share
     rest = split_dead_time(plant.sensors.dead_time, Ts)[1] if sensors else 0.0
-    caught = Caught(_pad(C[:-m], len(A)), Ts - rest) if rest else None
+    caught = Caught(pad(C[:-m], len(A)), Ts - rest) if rest else None
     Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share, caught)
     return readonly(A), readonly(Ad), readonly(Bd), control
 
@@ -350,7 +257,7 @@ def _stored_readings(
     return whole, np.vstack([B, np.zeros((p * late, B.shape[1]))]), np.eye(len(whole))[-p:]
 
 
-def _pad(C: FloatArray, n: int) -> FloatArray:
+def pad(C: FloatArray, n: int) -> FloatArray:
     """C of the first states as a matrix of all n."""
     return np.hstack([C, np.zeros((len(C), n - C.shape[1]))])
 
@@ -420,87 +327,6 @@ def commanded_model(model: LinearModel, controller: Controller) -> LinearModel:
     if believed is model.plant:
         return model
     return linearize(model.plant, model.operating_point, believed)
-
-
-def machine_law(
-    plant: Plant,
-    controller: Controller,
-    current_loops: CurrentLoops = LAST_STAGE,
-    *,
-    use: ReadingUse | None = None,
-    point: OperatingPoint | None = None,
-) -> Compensator:
-    """The control law with the machine's hold, delay and current loops.
-
-    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; "lag", first-order
-        lags at the crossover
-    use : of the reading besides the law
-    point : where the windings are at rest; None: at the centre
-
-    Raises InputError for other current loops, and beside PI current loops for a dead time of the sensors that is not
-    whole samples.
-    """
-    a = plant.actuator
-    delay = a.delay(controller.sample_time)
-    if chosen_loops(plant, controller, current_loops) == "lag":
-        # A delay of all readings is one of all forces.
-        late = plant.sensors.dead_time / controller.sample_time
-        return sampled_law(controller, whole_or_not(delay + late), a.crossover, use=use)
-    late = whole_samples(plant, controller.sample_time)
-    believed = plant_of(controller.parameters)
-    point = plant.at() if point is None else point
-    windings = windings_of(plant, believed, point, force_modes(believed))
-    control = current_control(controller, windings, point)
-    return sampled_law(controller, delay, a.crossover, control, late=late, use=use)
-
-
-def machine_system(
-    plant: Plant,
-    controller: Controller,
-    names: Sequence[str],
-    at: Mapping[str, float],
-    current_loops: CurrentLoops = LAST_STAGE,
-) -> tuple[UncertainSystem, Compensator]:
-    """The machine at rest under its loads at the states `at`, in parameters by name, and its control law.
-
-    These are the arguments of robust_margin. Raises CheckError where nothing holds the nominal machine there.
-    """
-    controller = law_at(controller, plant, plant.at(**at).x)
-    believed = plant_of(controller.parameters)
-    driven = chosen_loops(plant, controller, current_loops) == "pi"
-    system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()), driven)
-    handed = H is not None and system.matrices.size2_out(1) > len(H)
-    if plant.stroke.name in names:
-        slopes = slopes_along(plant, controller)
-        system = along_stroke(system, plant, slopes)
-        use = ReadingUse(H, handed, moved=() if slopes is None else slopes.forces)
-    else:
-        use = ReadingUse(H, handed, feedforward_slope(plant, controller, at))
-    return system, machine_law(plant, controller, current_loops, use=use, point=plant.at(**at))
-
-
-LOADS_LEFT_OUT = (
-    "without the slopes that its forces have under its loads at rest, which take too long to enclose"
-)
-
-
-@lru_cache(maxsize=16)  # every controller of a machine has it; plants compare by identity
-def _commanded_system(
-    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...], driven: bool
-) -> tuple[UncertainSystem, FloatArray | None]:
-    """The machine at the states `at` in parameters by name, and the gain of currents that are held; None: none are.
-
-    driven : whether the windings are states
-    """
-    states = dict(at)
-    H = held_gain(believed, states) if is_commutated(believed) else None
-    windings = windings_of(plant, believed, plant.at(**states), force_modes(believed)) if driven else None
-    made = partial(of_plant, plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
-    system = made()
-    if is_dear(system):
-        light = made(loaded=False)
-        system = replace(light, left_out=LOADS_LEFT_OUT, positive=system.positive, ends=system.ends)
-    return system, H
 
 
 @lru_cache(maxsize=16)  # every loop of a machine needs it; plants compare by identity

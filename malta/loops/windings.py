@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 
 CurrentLoops = Literal["lag", "pi"]
+LAST_STAGE: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 AXIS_TOLERANCE = 1e-9  # of the largest entry: what a map onto the commanded axes may leave
 
 

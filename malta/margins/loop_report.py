@@ -13,9 +13,9 @@ import numpy as np
 from malta.bound import at_least, at_most
 from malta.display import Curves, Description, display
 from malta.loops.loop import Loop, loop_of_model
-from malta.loops.sampled_loops import LAST_STAGE
-from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
-from malta.loops.windings import CurrentLoops, left_out
+from malta.loops.noise import noise_of
+from malta.loops.time_domain import Recovery, furthest, recovery
+from malta.loops.windings import LAST_STAGE, CurrentLoops, left_out
 from malta.margins.travel import NO_EXTENT, NOT_BETWEEN_TEXT, Extent
 from malta.merit_lists import in_groups
 from malta.merits import ROOTS, Merit, figure

@@ -16,13 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.budget import Budget, in_rounds
 from malta.linear.closed_loops import instability
 from malta.linear.expressions import NotAnalytic
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
+from malta.loops.parametric_loops import machine_system
 from malta.loops.parametric_plants import MAX_MODEL_OPERATIONS, model_of
-from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
-from malta.loops.windings import CurrentLoops
+from malta.loops.sampled_laws import machine_law
+from malta.loops.sampled_loops import loaded_loop
+from malta.loops.windings import LAST_STAGE, CurrentLoops
 from malta.margins.scheduled_loops import loops_between_places
 from malta.model.currents import is_commutated
 from malta.model.parameters import units_of
@@ -45,7 +48,7 @@ from malta.proof.robust import (
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.synthesis.law import point_at
-from malta.work import MORE_WORK, Budget, WorkUp, count_work, in_rounds
+from malta.work import MORE_WORK, WorkUp, count_work
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,12 +19,12 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.budget import Budget
 from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.feedforward_along import slopes_along
-from malta.loops.sampled_loops import LAST_STAGE
-from malta.loops.windings import chosen_loops, current_control, force_modes, windings_of
+from malta.loops.windings import LAST_STAGE, chosen_loops, current_control, force_modes, windings_of
 from malta.margins.travel import travel_loops
 from malta.model.currents import is_commutated
 from malta.model.plant import Plant
@@ -36,7 +36,6 @@ from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.linear_law import linear_law, with_forces_read
-from malta.work import Budget
 
 FACTOR = "gain factor"  # the name of the further parameter
 MAX_SCATTER = 0.2  # share by which gains may scatter at most: nothing beyond is looked at

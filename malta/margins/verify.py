@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from malta.budget import Budget
 from malta.errors import CheckError, InputError
 from malta.linear.closed_loops import instability
 from malta.linear.matrices import eigenvalues, system_matrix
@@ -24,16 +25,15 @@ from malta.loops.bandwidths import last_crossover, peak_of_channels, peak_sensit
 from malta.loops.classical import Classical, Nominal, classical_margins, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.parametric_plants import of_plant
+from malta.loops.sampled_laws import machine_law
 from malta.loops.sampled_loops import (
-    LAST_STAGE,
     SampledLoop,
     commanded_model,
     continuous_poles,
-    machine_law,
     sampled_loop,
     sorted_poles,
 )
-from malta.loops.windings import CurrentLoops, chosen_loops
+from malta.loops.windings import LAST_STAGE, CurrentLoops, chosen_loops
 from malta.margins.loop_report import BANDWIDTHS, ChainStage, LoopReport, Poles, StagePeak, TravelPlace
 from malta.margins.travel import (
     PLACE_WORK,
@@ -58,7 +58,7 @@ from malta.synthesis.filters import gain_at_rest, kalman
 from malta.synthesis.regulators import integrals_of, lqi, lqr
 from malta.synthesis.separation import controller_poles
 from malta.synthesis.weighting import weights_of
-from malta.work import Budget, count_work
+from malta.work import count_work
 
 
 @on_one_thread

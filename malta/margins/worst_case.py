@@ -6,8 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from malta.errors import InputError
-from malta.loops.sampled_loops import LAST_STAGE
-from malta.loops.windings import CurrentLoops
+from malta.loops.windings import LAST_STAGE, CurrentLoops
 from malta.processes import on_one_thread
 from malta.proof.margin import Ranges
 

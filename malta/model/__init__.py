@@ -8,11 +8,11 @@ if TYPE_CHECKING:
     from malta.model.actuator import Actuator as Actuator
     from malta.model.coils import Allocation as Allocation, allocation as allocation
     from malta.model.contacts import Contacts as Contacts
-    from malta.model.data import read_published as read_published
     from malta.model.inverse import InverseCheck as InverseCheck
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.parameters import check_parameters as check_parameters, si as si
     from malta.model.plant import OperatingPoint as OperatingPoint, Plant as Plant, Signal as Signal
+    from malta.model.printed import read_published as read_published
     from malta.model.sensors import Sensors as Sensors
     from malta.model.stroke import Stroke as Stroke
     from malta.units import in_unit as in_unit
@@ -21,11 +21,11 @@ _NAMES = {
     "malta.model.actuator": "Actuator",
     "malta.model.coils": "Allocation allocation",
     "malta.model.contacts": "Contacts",
-    "malta.model.data": "read_published",
     "malta.model.inverse": "InverseCheck",
     "malta.model.linearize": "LinearModel",
     "malta.model.parameters": "check_parameters si",
     "malta.model.plant": "OperatingPoint Plant Signal",
+    "malta.model.printed": "read_published",
     "malta.model.sensors": "Sensors",
     "malta.model.stroke": "Stroke",
     "malta.units": "in_unit",

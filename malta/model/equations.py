@@ -63,6 +63,3 @@ def note(block: str, text: str, times: int = 1, /, **values: Any) -> None:
     known = _recorded.get()
     if known is not None:
         known.append(Equation(block, text, values, times))
-
-
-# Tables in expressions: CasADi's MX interpolates them, and what writes firmware of SX records where they are read.

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.budget import Budget as Budget
     from malta.linear.uncertain import Compensator as Compensator, UncertainSystem as UncertainSystem
     from malta.proof.blocks import Dynamic as Dynamic
     from malta.proof.blocks.gain import Gain as Gain
@@ -35,9 +36,9 @@ if TYPE_CHECKING:
     from malta.proof.polynomial_margin import margin_of_polynomial as margin_of_polynomial
     from malta.proof.rates import RateBound as RateBound, prove_rate as prove_rate
     from malta.proof.robust import Interrupted as Interrupted
-    from malta.work import Budget as Budget
 
 _NAMES = {
+    "malta.budget": "Budget",
     "malta.linear.uncertain": "Compensator UncertainSystem",
     "malta.proof.blocks": "Dynamic",
     "malta.proof.blocks.gain": "Gain",
@@ -47,6 +48,5 @@ _NAMES = {
     "malta.proof.polynomial_margin": "margin_of_polynomial",
     "malta.proof.rates": "RateBound prove_rate",
     "malta.proof.robust": "Interrupted",
-    "malta.work": "Budget",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"varying": "malta.proof.prove_rate"})

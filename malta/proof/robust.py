@@ -25,6 +25,7 @@ from flint import arb, fmpq, fmpq_mat
 from scipy import linalg
 
 from malta.arguments import by_name, describe, is_pair, positive
+from malta.budget import GROWTH, WORK, Budget, in_rounds
 from malta.errors import InputError
 from malta.linear.branches import branch_cases
 from malta.linear.compensators import compensator_of
@@ -40,7 +41,7 @@ from malta.proof.margin import IDLE_TEXT, NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.problem import OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.question import Question, Standing
 from malta.proof.search import search
-from malta.work import GROWTH, MORE_WORK, WORK, Budget, in_rounds, is_past
+from malta.work import MORE_WORK, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #

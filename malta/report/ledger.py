@@ -38,9 +38,9 @@ from malta.bound import at_least
 from malta.errors import InputError
 from malta.margins.loop_report import ZONES, LoopReport
 from malta.margins.verify import linear_report
-from malta.model.data import PublishedFigure, half_of_last_digit, published_figure
 from malta.model.linearize import LinearModel, linearize
 from malta.model.parts import require_part
+from malta.model.printed import PublishedFigure, half_of_last_digit, published_figure
 from malta.proof.margin import Margin
 from malta.simulation.experiments import Experiment, Progress, progress_of_part
 from malta.simulation.experiments.catalogue import experiment

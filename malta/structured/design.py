@@ -14,7 +14,7 @@ import numpy as np
 import tomlkit
 
 from malta.errors import CheckError, InputError, relocate_errors
-from malta.loops.time_domain import noise_variance
+from malta.loops.noise import noise_variance
 from malta.model.linearize import linearize
 from malta.structured import goals as kinds
 from malta.structured.goals import Goal, noise_limit, sensitivity, soft

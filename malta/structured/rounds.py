@@ -26,8 +26,8 @@ from malta.linear.sampling import add_lags, delay_inputs, sample, split_delay
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
-from malta.loops.sampled_loops import LAST_STAGE, SampledLoop, sampled_loop
-from malta.loops.windings import chosen_loops
+from malta.loops.sampled_loops import SampledLoop, sampled_loop
+from malta.loops.windings import LAST_STAGE, chosen_loops
 from malta.margins.travel import travel_margin
 from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import linearize

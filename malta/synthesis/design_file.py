@@ -24,10 +24,11 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import locate
-from malta.model.data import read, read_published
+from malta.model.data import read
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.model.plants import plant_of
+from malta.model.printed import read_published
 from malta.synthesis.design_tables import (
     BasesTable,
     DesignFile,

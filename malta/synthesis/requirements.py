@@ -19,9 +19,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-import numpy as np
-from scipy import special
-
 from malta.arrays import ComplexArray, FloatArray
 from malta.model.parts import attribute_of
 from malta.model.plant import Parameters, Plant, Signal
@@ -38,7 +35,6 @@ Form = Literal["number", "switch", "outputs", "inputs", "loads"]
 Verdict = Literal["holds", "fails", "undecided"]
 Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
 SEEDS = (4, 8, 16, 32)  # numbers of seeds after which a simulated figure is compared with its bound
-CONFIDENCE = 0.95  # of the intervals at all of SEEDS together
 
 
 class Figure(NamedTuple):
@@ -206,86 +202,7 @@ def judge_figure(figure: Figure, asked: float | None, *, at_least: bool) -> Verd
     return "holds" if all(within) else "undecided" if any(within) else "fails"
 
 
-def mean_over_seeds(
-    draw: Callable[[int], float], asked: float, source: str, *, at_least: bool = False
-) -> Figure:
-    """Average a simulated figure over seeds of the noise until its interval decides against the bound.
-
-    After each number n of SEEDS the interval is mean -+ t s / sqrt(n), with Student's t (two sides) for a confidence of
-    1 - (1 - CONFIDENCE) / len(SEEDS), so that all of them hold the expected value with CONFIDENCE (Bonferroni).
-    Figures are taken as normal. No clock ends it, so that no verdict depends on the speed of a computer.
-
-    draw : seed -> the figure of one run; infinite for a run that failed
-    asked : the bound
-
-    Returns a Figure with its interval, after the last of SEEDS whether or not that decides; of a failed run an
-    infinite one.
-
-    >>> mean_over_seeds(lambda seed: 2.0 + 0.1 * (seed % 2), 3.0, "a run").source
-    'a run, 4 seeds'
-    """
-    found: list[float] = []
-    for n in SEEDS:
-        found += [draw(seed) for seed in range(len(found), n)]
-        if not all(map(math.isfinite, found)):
-            return Figure(math.inf, f"{source}, a run of {n} failed")
-        mean, spread = float(np.mean(found)), float(np.std(found, ddof=1))
-        t = float(special.stdtrit(n - 1, 1 - (1 - CONFIDENCE) / (2 * len(SEEDS))))
-        half = t * spread / math.sqrt(n)
-        figure = Figure(mean, f"{source}, {n} seeds", (mean - half, mean + half))
-        if judge_figure(figure, asked, at_least=at_least) != "undecided":
-            break
-    return figure
-
-
-def reached_with_every_seed(draw: Callable[[int], bool], reached: float, source: str) -> Figure:
-    """Judge a flight that ends well or does not: the figure where it does with each of SEEDS[0] seeds, else 0.
-
-    A yes or no has no mean that an interval could separate from a bound; the source says how many flights it was.
-
-    draw : seed -> whether the flight ends well
-    reached : the figure of flights that do
-
-    >>> reached_with_every_seed(lambda seed: seed < 3, 0.2, "stroke")
-    Figure(value=0.0, source='stroke, 3 of 4 seeds', interval=None)
-    """
-    count = sum(draw(seed) for seed in range(SEEDS[0]))
-    well = count == SEEDS[0]
-    return Figure(reached if well else 0.0, f"{source}, {'' if well else f'{count} of '}{SEEDS[0]} seeds")
-
-
-# --- requirements that machines make of their outputs, inputs and experiments ---
-
-
-def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
-    """Bound the true motion of some outputs at rest, rms, from the sensors' noise and steps: the worst of them."""
-    meaning = f"{heading} motion at rest, rms, from the sensors' noise and steps"
-    return _noise_at_rest(
-        name,
-        "motion",
-        lambda plant, _: outputs(plant),
-        unit="m",
-        heading=heading,
-        meaning=meaning,
-        indices=outputs,
-    )
-
-
-def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
-    """Bound the noise of some commanded forces at rest, rms: the worst of them."""
-    meaning = f"noise of the commanded {heading} at rest, rms"
-    return _noise_at_rest(
-        name,
-        "force",
-        lambda plant, _: inputs(plant),
-        unit="N",
-        heading=heading,
-        meaning=meaning,
-        indices=inputs,
-    )
-
-
-def _noise_at_rest(
+def noise_at_rest(
     name: str, kind: Trade, chosen: Callable[[Plant, str], Sequence[int]], **fields: Any
 ) -> Requirement:
     """A bound of motion or force, of the worst of those that are chosen by plant and signal: by the covariance."""
@@ -301,12 +218,6 @@ def _noise_at_rest(
         return max((float(value) for k, value in noise if k in own), default=None)
 
     return Requirement(name, measure, laws=("LQG", "PID"), estimate=estimate, trade=kind, **fields)
-
-
-def worst_merit(experiment: Any) -> float:
-    """Take the largest of the first figure of merit over an experiment's cases; infinite where it failed."""
-    worst = max(case.merits[0].value for case in experiment.cases)
-    return math.inf if experiment.failed else float(worst)
 
 
 # --- the requirements of every machine ---
@@ -388,14 +299,14 @@ GENERIC_REQUIREMENTS = (
         estimate=_recovery_estimate,
         meaning="what a constant load from outside does, by the name of a load",
     ),
-    _noise_at_rest(
+    noise_at_rest(
         "motion",
         "motion",
         lambda plant, signal: _index(plant.outputs, signal),
         form="outputs",
         meaning="motion of outputs at rest, rms, from the sensors' noise and steps",
     ),
-    _noise_at_rest(
+    noise_at_rest(
         "force_noise",
         "force",
         lambda plant, signal: _index(plant.inputs, signal),

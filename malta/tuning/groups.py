@@ -28,9 +28,9 @@ from malta.linear.peaks import largest_gain
 from malta.linear.sampling import add_lags, sample
 from malta.loops.bandwidths import last_crossover, tracked_band
 from malta.loops.classical import Nominal
+from malta.loops.noise import covariance, noise_variance
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import SampledLoop, disturbance_map, push_through
-from malta.loops.time_domain import covariance, noise_variance
 from malta.loops.windings import (
     WindingModel,
     emf_slope,

@@ -7,8 +7,8 @@ from collections.abc import Collection
 from malta.margins.loop_report import LoopReport, Outcome
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
+from malta.tuning.outcomes import judge_controller
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import judge_controller
 
 
 def judge(

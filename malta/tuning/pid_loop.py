@@ -14,8 +14,8 @@ from malta.linear.peaks import smooth_peak
 from malta.linear.sampling import sample, sample_noise
 from malta.loops.bandwidths import last_crossover, tracked_band
 from malta.loops.loop import loop_of_model
+from malta.loops.noise import covariance
 from malta.loops.sampled_loops import SampledLoop
-from malta.loops.time_domain import covariance
 from malta.loops.windings import emf_slope, windings_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize

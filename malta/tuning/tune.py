@@ -14,17 +14,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-import tomlkit
-from scipy import optimize
-from tomlkit.items import Item
 
 from malta.arrays import FloatArray
 from malta.display import Description, display
@@ -37,6 +33,7 @@ from malta.synthesis.requirements import Trade, base_of, ratio_of, requirements_
 from malta.synthesis.spec import Spec
 from malta.synthesis.weighting import Weights
 from malta.tuning import groups, pid
+from malta.tuning.descent import BoundPenalty, descend
 from malta.tuning.groups import STEP, TuningGroup, figures_of, groups_of
 from malta.tuning.judging import judge
 from malta.tuning.search import (
@@ -55,124 +52,6 @@ from malta.tuning.search import (
     model_and_controller,
     separate,
 )
-
-# Descent by linear programs: the smallest worst ratio, or the least noise that bounds allow.
-#
-#     minimize  f(u) + steep max(floor, max_i r_i(u))        over the unit cube
-#
-# r_i are logarithms of the ratios of what is found to what is asked for, so 0 is a bound that is just reached. The
-# worst of them is as smooth as a roof: it has an edge where the best place is, which simplices and random members
-# only stumble on. Each step linearizes f and every r_i by differences and solves
-#
-#     minimize  f' d + steep s      subject to  r_i + r_i' d <= s,  s >= floor,  |d_k| <= radius
-#
-# The radius follows how well the last step was foretold.
-
-
-MIN_RADIUS, MAX_RADIUS, FIRST_RADIUS = 2e-3, 0.5, 0.2  # of the radius
-DIFFERENCES = (0.02, 0.06, 0.007)  # steps of u, the next where one leads no further
-TRIES = 5  # smaller radii with one linearization
-LEAST_GAIN = 1e-6  # of a step
-
-
-class Point(NamedTuple):
-    """A place that was tried: f, and r of fixed length."""
-
-    u: FloatArray
-    f: float
-    r: FloatArray
-
-
-class BoundPenalty(NamedTuple):
-    """How bounds count beside the objective."""
-
-    steep: float = 1.0
-    floor: float = -math.inf  # of the worst r, below which it counts no more
-
-    def of(self, point: Point) -> float:
-        """Return what is minimized at a point."""
-        return point.f + self.steep * max(self.floor, float(point.r.max()))
-
-
-Look = Callable[["FloatArray"], tuple[float, "FloatArray"] | None]  # (f, r) of a place; None: unstable
-
-
-def descend(look: Look, u: FloatArray, merit: BoundPenalty, trials: int) -> FloatArray:
-    """Go down from a place until a number of trials or until no step leads further; an unstable place stays.
-
-    >>> import numpy as np
-    >>> roof = lambda u: (0.0, np.array([u[0] - u[1], u[1] - 0.5, 0.3 - u[0]]))
-    >>> bool(
-    ...     np.allclose(
-    ...         descend(roof, np.array([0.9, 0.1]), Merit(), 200),
-    ...         [0.3667, 0.4333],
-    ...         atol=1e-3,
-    ...     )
-    ... )
-    True
-    """
-    start = look(u) if len(u) and trials > 0 else None
-    if start is None:
-        return u
-    here, radius, stuck, used = Point(u, *start), FIRST_RADIUS, 0, 1
-    while used < trials and stuck < len(DIFFERENCES):
-        slopes = _slopes(look, here, DIFFERENCES[stuck])
-        there, radius, tries = _advance(look, here, slopes, merit, radius)
-        used += len(u) + tries
-        here = there or here
-        if radius < MIN_RADIUS:
-            stuck, radius = stuck + 1, FIRST_RADIUS / 2
-    return here.u
-
-
-def _advance(
-    look: Look, here: Point, slopes: tuple[FloatArray, FloatArray], merit: BoundPenalty, radius: float
-) -> tuple[Point | None, float, int]:
-    """The next place, or None, the next radius, and how many places were tried."""
-    for tries in range(1, TRIES + 1):
-        d, foretold = _step(here, slopes, merit, radius)
-        found = look(here.u + d)
-        there = None if found is None else Point(here.u + d, *found)
-        gain = 0.0 if there is None else merit.of(here) - merit.of(there)
-        if gain > LEAST_GAIN:
-            share = gain / max(merit.of(here) - foretold, 1e-12)
-            if share > 0.7:
-                return there, min(radius * 1.5, MAX_RADIUS), tries
-            return there, radius * (1.0 if share > 0.3 else 0.6), tries
-        radius *= 0.4
-        if radius < MIN_RADIUS:
-            break
-    return None, radius, tries
-
-
-def _slopes(look: Look, here: Point, step: float) -> tuple[FloatArray, FloatArray]:
-    """f' and r' by differences, towards the inside of the cube; zero along what makes the loop unstable."""
-    slope, J = np.zeros(len(here.u)), np.zeros((len(here.r), len(here.u)))
-    for k in range(len(here.u)):
-        h = step if here.u[k] + step <= 1 else -step
-        there = look(here.u + h * np.eye(len(here.u))[k])
-        if there is not None:
-            slope[k], J[:, k] = (there[0] - here.f) / h, (there[1] - here.r) / h
-    return slope, J
-
-
-def _step(
-    here: Point, slopes: tuple[FloatArray, FloatArray], merit: BoundPenalty, radius: float
-) -> tuple[FloatArray, float]:
-    """The step of the linear program, and what it promises."""
-    slope, J = slopes
-    low, high = np.maximum(-radius, -here.u), np.minimum(radius, 1 - here.u)
-    floor = None if math.isinf(merit.floor) else merit.floor
-    found = optimize.linprog(
-        np.append(slope, merit.steep),
-        A_ub=np.hstack([J, -np.ones((len(J), 1))]),
-        b_ub=-here.r,
-        bounds=[*zip(low.tolist(), high.tolist(), strict=True), (floor, None)],
-    )
-    if found.x is None or found.fun is None:
-        return np.zeros(len(here.u)), merit.of(here)
-    return np.asarray(found.x[:-1]), here.f + float(found.fun)
-
 
 FRONT = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the margin that is asked for
 MIN_RATIO = 1e-3  # ratio below which a figure counts as nothing
@@ -471,36 +350,3 @@ def problem_sha256(spec: Spec) -> str:
     settings = (FRONT, DIGITS, groups.STEP, groups.CORNER_FACTOR)
     content = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-# Trial -> design file: the file that was given with other numbers, all else as it stands.
-
-
-def design_text(spec: Spec, trial: Trial, target: Path) -> str:
-    """Write the text of the design file with the numbers of a trial, for another folder.
-
-    Comments, the order of keys and all other values stay as they stand in spec.path.
-    """
-    document = tomlkit.parse(spec.path.read_text(encoding="utf-8"))
-    document["machine"] = Path(
-        os.path.relpath(spec.machine_file.resolve(), target.resolve().parent)
-    ).as_posix()
-    if spec.pid is None:
-        document["delay"] = trial.delay
-    for variable, value in zip(spec.search, trial.values, strict=True):
-        for entry in variable.entries:
-            *tables, name = entry.split(".")
-            table: Any = document
-            for key in tables:
-                table = table[key]
-            if isinstance(table[name], dict):
-                table[name]["value"] = _number(value)
-                table[name]["unit"] = variable.unit
-            else:
-                table[name] = _number(value)
-    return tomlkit.dumps(document)
-
-
-def _number(value: float) -> Item:
-    """A number as the file shall hold it, in as many digits as were tried."""
-    return tomlkit.value(f"{value:.{DIGITS}g}")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,155 +12,23 @@ from malta.errors import CheckError, InputError
 from malta.files import locate
 from malta.gains.file import content_of
 from malta.gains.stable import read_stable
-from malta.loops.loop import Loop, loop_of_model
-from malta.loops.sampled_loops import LAST_STAGE
-from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
-from malta.loops.windings import CurrentLoops
-from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
+from malta.loops.windings import LAST_STAGE, CurrentLoops
+from malta.margins.loop_report import LoopReport
 from malta.margins.schedule_rates import schedule_rate
 from malta.margins.travel import LoopAlong
 from malta.margins.verify import linear_report, staged_report
 from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import Parameters, Plant
+from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.model.soundness import unproven
 from malta.proof.margin import Progress, Ranges
-from malta.simulation.experiments import Experiment
-from malta.simulation.experiments.catalogue import experiment, payload
-from malta.simulation.scenario import Scenario
-from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import Trajectory
+from malta.simulation.experiments.payloads import payload
 from malta.synthesis.controller import Controller
-from malta.synthesis.requirements import Figure, NoiseRms, Requirement, base_of, requirements_for
-from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
+from malta.tuning.outcomes import entries_without_flights, judge_controller
 
 if TYPE_CHECKING:
-    from malta.synthesis.recovery import RecoveryBound
     from malta.synthesis.spec import Spec
-
-# What a design has of what it is asked for: requirements measured on its verified loop and simulated machine.
-
-
-@dataclass(frozen=True, eq=False)
-class SynthesizedDesign:
-    """A design with its controller: what requirements are measured on (synthesis.requirements.Design)."""
-
-    spec: Spec
-    model: LinearModel
-    controller: Controller
-    verified: LoopReport | None = None  # where it is known: with the margin over the spec's own uncertainty
-
-    @property
-    def plant(self) -> Plant:
-        """The machine that the controller is designed for."""
-        return self.spec.plant
-
-    @property
-    def loop(self) -> Loop:
-        """The machine's loop at the design's operating point."""
-        return loop_of_model(self.model, self.controller)
-
-    @cached_property
-    def margins(self) -> LoopReport:
-        """The verified loop, with the proven robust margin where one is asked for."""
-        if self.verified is not None:
-            return self.verified
-        box = self.spec.uncertainty if "margin" in self.spec.specification else None
-        return linear_report(self.model, self.controller, box)
-
-    @property
-    def bandwidth(self) -> Figure:
-        """The smallest by the definitions of verify, rad/s, and which one it is."""
-        bandwidths = self.margins.bandwidth
-        narrow = min(bandwidths, key=lambda key: bandwidths[key])
-        return Figure(bandwidths[narrow], BANDWIDTHS[narrow])
-
-    @cached_property
-    def noise(self) -> NoiseRms:
-        """Motion and commanded forces at rest, rms, by the covariance of the machine's linear loop."""
-        return noise_of(self.loop.sampled, self.plant)
-
-    @cached_property
-    def load_figures(self) -> Mapping[str, float]:
-        """Of a PID under the loads of [cost], by name and output; none where its loop is unstable."""
-        whole = whole_machine(self.model, self.controller, loads_of(self.spec))
-        return loop_figures(self.spec, whole, self.loop.sampled)
-
-    def deviation(self, bound: RecoveryBound) -> Figure:
-        """Under a constant load from outside, at the operating point or at the worst of some places of the travel."""
-        if bound.anywhere:
-            worst, position = worst_along(self.plant, self.controller, bound)
-            return Figure(worst, f"linear loop, at {1e3 * position:.3g} mm")
-        return Figure(bounded_deviation(self.plant, self.controller, bound), "linear loop")
-
-    def fly(self, name: str, **options: Any) -> Experiment:
-        """Run an experiment of the machine. Raises KeyboardInterrupt when Ctrl-C cut the experiment short."""
-        e = experiment(name, self.plant, self.controller, **options)
-        if e.interrupted or any(case.run.verdict.name == "interrupted" for case in e.cases):
-            raise KeyboardInterrupt
-        return e
-
-    def simulate(self, parameters: Parameters, scenario: Scenario) -> Trajectory:
-        """Run a scenario on a machine with other parameters. Raises KeyboardInterrupt as `fly`."""
-        run = simulate(self.plant.variant(parameters), self.controller, scenario)
-        if run.verdict.name == "interrupted":
-            raise KeyboardInterrupt
-        return run
-
-
-def judge_controller(
-    spec: Spec, controller: Controller, names: Collection[str], verified: LoopReport | None = None
-) -> tuple[Outcome, ...]:
-    """Measure requirements of a design with a controller: see judging.judge."""
-    model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
-    design = SynthesizedDesign(spec, model, controller, verified)
-    outcomes = _load_errors(design) if spec.pid else []
-    for name in names:
-        outcomes += outcomes_of(design, name)
-    return tuple(outcomes)
-
-
-def entries_without_flights(spec: Spec) -> list[str]:
-    """List the entries of a specification that are measured on the linear loop, without flights of the machine."""
-    known = requirements_for(spec.plant)
-    return [name for name in spec.specification if base_of(name) in known and not known[base_of(name)].flown]
-
-
-def outcomes_of(design: SynthesizedDesign, name: str) -> list[Outcome]:
-    """Measure one entry of the specification: a figure for each way to measure the requirement.
-
-    Raises InputError for a requirement that the machine does not have.
-    """
-    spec, known = design.spec, requirements_for(design.plant)
-    if base_of(name) not in known:
-        raise InputError(
-            spec.path, f"specification.{name}", "an unknown requirement", "one of " + " ".join(known)
-        )
-    requirement, signal, asked = known[base_of(name)], name.partition(" ")[2], spec.specification[name]
-    unit = requirement.unit_of(spec, signal)
-    return [
-        Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least, figure.interval)
-        for figure in _measure(requirement, design, asked, signal)
-    ]
-
-
-def _measure(requirement: Requirement, design: SynthesizedDesign, asked: float, signal: str) -> list[Figure]:
-    """The figures of a requirement; the worst there is where the loop is unstable and so has none."""
-    if requirement.needs_stability and not design.margins.stable:
-        return [Figure(0.0 if requirement.at_least else math.inf, "unstable loop")]
-    return list(requirement.measure(design, asked, signal))
-
-
-def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
-    plant, outcomes = design.plant, []
-    for output, force, size in zip(plant.outputs, plant.inputs, loads_of(design.spec).load, strict=True):
-        name = f"load_error {output.name}"
-        how = f"constant force, {size:g} {force.unit} at {force.name}"
-        found = design.load_figures.get(name, math.inf)
-        outcomes.append(Outcome(name, None, found, f"{output.unit} s^0.5", how))
-    return outcomes
-
 
 MARGIN_SHARE = 0.5  # of the time of a verification, which the margins take
 

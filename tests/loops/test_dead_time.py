@@ -22,7 +22,8 @@ from malta.linear.open_loops import open_systems, responses
 from malta.linear.sampling import sample, split_delay, stored_blocks
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator
-from malta.loops.sampled_loops import SampledLoop, machine_system
+from malta.loops.parametric_loops import machine_system
+from malta.loops.sampled_loops import SampledLoop
 from malta.model.sensors import Sensors
 from malta.proof.certificate import write_certificate
 

@@ -19,10 +19,11 @@ from magnets import MACHINES
 import malta
 from malta import gains
 from malta.linear.closed_loops import closed_loop, instability
-from malta.loops.sampled_loops import LOADS_LEFT_OUT, loaded_model, machine_loop, machine_system
+from malta.loops.parametric_loops import LOADS_LEFT_OUT, machine_system
+from malta.loops.sampled_loops import loaded_model, machine_loop
 from malta.margins.travel import place_margin
 from malta.model.parameters import twins_of
-from malta.simulation.experiments.catalogue import settle_feedforward
+from malta.simulation.experiments.witness import settle_feedforward
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray

@@ -18,8 +18,8 @@ import malta
 from malta.gains.encodings import content_sha256
 from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.machines.halbach.parameters import GAP, Parameters
-from malta.model.data import published_value
 from malta.model.parameters import values_of
+from malta.model.printed import published_value
 from malta.synthesis.design_models import sampled_model
 
 if TYPE_CHECKING:

@@ -37,8 +37,8 @@ from malta.machines.halbach.open_loop import (
 )
 from malta.machines.halbach.paper import HalbachEvidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import published_value
 from malta.model.plant import Plant
+from malta.model.printed import published_value
 from malta.report.ledger import ledger
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments.catalogue import cases_of, experiment

@@ -16,8 +16,8 @@ import malta
 from malta.machines.halbach import electronics, electronics as motor, paper as claims
 from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL_ELECTRONICS, IQ_BITS, Options
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import published_value
 from malta.model.plants import plant_of
+from malta.model.printed import published_value
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory

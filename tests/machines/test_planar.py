@@ -21,8 +21,8 @@ from hypothesis import given, settings, strategies as st
 import malta
 from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
-from malta.model.data import published_value, read_published
 from malta.model.plant import symbolic
+from malta.model.printed import published_value, read_published
 from malta.model.rigid_body import rotation
 from malta.simulation.engine.engines import translate
 from malta.simulation.references import QUINTIC_DURATION, quintic

@@ -27,7 +27,7 @@ from malta.machines.planar import (
     plant as planar,
 )
 from malta.margins.loop_report import LoopReport
-from malta.model.data import published_value, read_published
+from malta.model.printed import published_value, read_published
 from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
 from malta.simulation.experiments import Experiment

@@ -25,8 +25,11 @@ from malta.linear.open_loops import responses
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal, balanced_norm, classical_margins, delay_margins, disk_margins_alone
-from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
+from malta.loops.parametric_loops import machine_system
+from malta.loops.sampled_laws import machine_law
+from malta.loops.sampled_loops import loaded_loop
 from malta.loops.uncertain_models import uncertain
+from malta.loops.windings import LAST_STAGE
 from malta.margins.loop_report import LoopReport
 from malta.margins.travel import place_margin
 from malta.margins.verify import (

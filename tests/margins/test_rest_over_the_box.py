@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 import malta
 from malta.linear.closed_loops import closed_loop
-from malta.loops.sampled_loops import machine_system
+from malta.loops.parametric_loops import machine_system
 from malta.model import Actuator, Plant, Sensors, Signal, check_parameters, si
 from malta.proof.box import box_of, within_branches
 

@@ -16,7 +16,7 @@ import pytest
 
 import malta
 from malta.linear.closed_loops import instability
-from malta.loops.sampled_loops import machine_system
+from malta.loops.parametric_loops import machine_system
 from malta.model import Actuator, Plant, Sensors, Signal, check_parameters, si
 
 if TYPE_CHECKING:

@@ -29,17 +29,11 @@ from malta.proof.margin import NOT_PROVEN
 from malta.report.page.analysis import key_figures
 from malta.report.tables.design import requirements_table
 from malta.report.verdict import verdict_html, verdict_lines, verdict_text
-from malta.synthesis.requirements import (
-    SEEDS,
-    Figure,
-    Verdict,
-    judge_figure,
-    mean_over_seeds,
-    reached_with_every_seed,
-)
+from malta.synthesis.machine_requirements import mean_over_seeds, reached_with_every_seed
+from malta.synthesis.requirements import SEEDS, Figure, Verdict, judge_figure
 from malta.tuning.judging import judge
+from malta.tuning.outcomes import SynthesizedDesign, entries_without_flights, outcomes_of
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import SynthesizedDesign, entries_without_flights, outcomes_of
 
 if TYPE_CHECKING:
     from pathlib import Path

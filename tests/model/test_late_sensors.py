@@ -17,7 +17,8 @@ from scipy.optimize import brentq
 
 import malta
 from malta.linear.closed_loops import instability
-from malta.loops.sampled_loops import machine_loop, machine_system
+from malta.loops.parametric_loops import machine_system
+from malta.loops.sampled_loops import machine_loop
 from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin
 from malta.model.linearize import linearize

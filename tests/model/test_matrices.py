@@ -18,7 +18,7 @@ from conftest import refusal
 
 import malta
 from malta.gains import encodings
-from malta.loops.sampled_loops import machine_system
+from malta.loops.parametric_loops import machine_system
 from malta.model.linear.formulas import value_of
 from malta.model.linear.machine import formula
 from malta.model.plant import Plant, Signal

@@ -14,12 +14,13 @@ from magnets import BENCH, MACHINES, bench, two_coils
 import malta
 from malta.app.linear_run import linear_run
 from malta.linear.expressions import program
+from malta.loops.parametric_loops import machine_system
 from malta.loops.parametric_plants import of_plant
 from malta.loops.rest import Unknowns, solve_rows
-from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
+from malta.loops.sampled_loops import loaded_model, machine_loop
 from malta.model.equilibrium import with_command
 from malta.model.plant import OperatingPoint
-from malta.simulation.experiments.catalogue import held_payload
+from malta.simulation.experiments.payloads import held_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable

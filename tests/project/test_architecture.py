@@ -32,6 +32,7 @@ GROUND = (
     "merits",
     "merit_lists",
     "work",
+    "budget",
     "arguments",
 )
 ORDER = (*GROUND, *PACKAGES[1:])
@@ -236,6 +237,58 @@ def test_rooms_keep_to_what_they_know() -> None:
         if {*module.split(".")[:2]} & {*NEVER.get(package_of(module_of(path)) or "", ())}
     }
     assert broken == set()
+
+
+# What a function's module never reaches, however far its imports lead, in functions too: packages and modules of malta.
+UNREACHED = {
+    "gains.file": ("loops", "proof", "margins", "simulation", "writing", "interrupts", "merits"),
+    "simulation.simulate": (
+        *("loops", "proof", "margins", "gains", "writing", "interrupts", "merit_lists", "tables"),
+        *("model.data", "model.signal_groups", "model.table_look_ups", "synthesis.spec", "synthesis.lqg"),
+        *("simulation.trajectory_file", "simulation.engine.batch", "simulation.engine.sample_loops"),
+    ),
+    "loops.sampled_loops": (
+        "proof",
+        "simulation",
+        "loops.rest",
+        "linear.expressions",
+        "linear.rational",
+        "work",
+    ),
+    "loops.loop": (
+        *("proof", "simulation", "linear.closed_loops", "linear.open_loops", "linear.systems", "budget"),
+        *("loops.channel_margins", "loops.bandwidths", "synthesis.spec", "synthesis.recovery"),
+    ),
+    "proof.robust": (
+        *("model", "synthesis", "loops", "linear.open_loops", "linear.diagrams", "linear.reduction"),
+        *("linear.rational_tables", "linear.peaks", "linear.systems", "proof.rates", "proof.blocks"),
+    ),
+    "tuning.verify": (
+        *("firmware", "campaigns", "identification", "report", "synthesis.spec", "synthesis.lqg"),
+        *("synthesis.recovery", "synthesis.design_file", "linear.systems", "proof.certificate"),
+    ),
+    "firmware.export": (
+        *("campaigns", "tuning", "report", "proof.rates", "proof.blocks", "margins.schedule_rates"),
+        *("margins.verify", "synthesis.requirements", "synthesis.recovery", "linear.systems"),
+    ),
+}
+
+
+def test_a_function_does_not_reach_what_it_does_not_need() -> None:
+    """`make architecture` counts the lines that are left to read."""
+    trees = {
+        f"malta.{one}" if one else "malta": tree_of(path) for path in SOURCES for one in [module_of(path)[6:]]
+    }
+    imports = {name: imported(tree) & trees.keys() for name, tree in trees.items()}
+    for entry, others in UNREACHED.items():
+        found = {name.removeprefix("malta.") for name in reached([f"malta.{entry}"], imports)}
+        assert entry in found
+        for other in others:
+            assert f"malta.{other}" in trees
+            assert not {name for name in found if name == other or name.startswith(f"{other}.")}, (
+                entry,
+                other,
+            )
 
 
 def test_what_a_function_needs_is_counted_by_what_runs() -> None:

@@ -15,8 +15,8 @@ from conftest import refusal
 import malta
 from malta import units
 from malta.machines.tubular import plant as tubular
-from malta.model.data import read_published
 from malta.model.parameters import units_of
+from malta.model.printed import read_published
 from malta.tables import load_toml
 from malta.units import to_si, unit_factor
 

@@ -28,7 +28,7 @@ from malta.checker.loop import determinant_bounds
 from malta.errors import CheckError, InputError
 from malta.gains.certified import check, origin_of
 from malta.linear.uncertain import Compensator
-from malta.loops.sampled_loops import LAST_STAGE
+from malta.loops.windings import LAST_STAGE
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof import certificate
 

@@ -19,7 +19,9 @@ from malta.linear.open_loops import responses
 from malta.linear.sampling import sample
 from malta.linear.uncertain import UncertainSystem
 from malta.loops.own_model import unstable_gain
-from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
+from malta.loops.parametric_loops import machine_system
+from malta.loops.sampled_laws import sampled_law
+from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.loops.uncertain_models import uncertain
 from malta.loops.windings import left_out
 from malta.margins.travel import travel_margin

@@ -19,7 +19,8 @@ from malta.errors import InputError
 from malta.linear.closed_loops import critical_frequency, instability
 from malta.linear.open_loops import responses
 from malta.linear.uncertain import Compensator, UncertainSystem
-from malta.loops.sampled_loops import machine_law, machine_system
+from malta.loops.parametric_loops import machine_system
+from malta.loops.sampled_laws import machine_law
 from malta.loops.uncertain_models import uncertain
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators

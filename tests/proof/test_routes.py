@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 import malta
+from malta.budget import Budget
 from malta.proof import routes, search
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.routes import Attempt, Route
-from malta.work import Budget
 
 BOX = {"m": 0.1, "k": 0.1}
 

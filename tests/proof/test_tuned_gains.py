@@ -12,7 +12,7 @@ from exported import controller
 
 import malta
 from malta.linear.closed_loops import closed_loop, instability
-from malta.loops.sampled_loops import machine_system
+from malta.loops.parametric_loops import machine_system
 from malta.margins.travel import travel_loops
 from malta.margins.tuned_gains import MAX_SCATTER, GainBox, gain_box, tuned_loop
 from malta.proof.groups import groups, loop_of

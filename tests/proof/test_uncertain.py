@@ -12,7 +12,8 @@ import malta
 from malta.errors import InputError
 from malta.linear.closed_loops import closed_loop, critical_frequency, instability
 from malta.linear.open_loops import responses
-from malta.loops.sampled_loops import machine_law, sampled_loop
+from malta.loops.sampled_laws import machine_law
+from malta.loops.sampled_loops import sampled_loop
 from malta.loops.uncertain_models import uncertain
 from malta.proof.robust import robust_margin
 

@@ -272,8 +272,8 @@ def test_couplings_are_bounded_where_a_cell_is() -> None:
 @pytest.mark.slow
 def test_a_stronger_coupling_proves_less() -> None:
     """The bound follows what couples the axes: ten times the stiffness of held currents costs some of it."""
+    from malta.budget import Budget
     from malta.proof.robust import ProofEffort, margin_of
-    from malta.work import Budget
 
     _, _, problem = machine()
     h = problem.machine

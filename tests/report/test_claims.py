@@ -28,8 +28,8 @@ from malta.machines.tubular.paper.quantities import (
     is_solved_for_ratio,
     mean_of_seeds,
 )
-from malta.model.data import PublishedFigure, half_of_last_digit, published_figure, published_value
 from malta.model.plants import plant_of
+from malta.model.printed import PublishedFigure, half_of_last_digit, published_figure, published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Chance, Ledger, LedgerClaim, Row, is_reproduced
 from malta.simulation.engine.compiled import compiler

@@ -16,7 +16,8 @@ import malta
 from malta import gains
 from malta.gains.encodings import content_sha256
 from malta.gains.writing import document
-from malta.loops.sampled_loops import machine_law, machine_loop
+from malta.loops.sampled_laws import machine_law
+from malta.loops.sampled_loops import machine_loop
 from malta.machines.planar import motions
 from malta.model.fingerprint import fingerprint
 from malta.model.plants import plant_of

@@ -26,8 +26,8 @@ from malta.machines.tubular.experiments import (
     lifting,
     strokes,
 )
-from malta.model.data import published_value
 from malta.model.plants import plant_of
+from malta.model.printed import published_value
 from malta.simulation.experiments import Case, Experiment, Merit, compliance
 from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import ESTIMATORS, Fault, Scenario

@@ -13,7 +13,7 @@ from conftest import Run
 import malta
 from malta import gains
 from malta.model.plants import plant_of
-from malta.simulation.experiments.catalogue import FINENESS, flown_payload, held_payload, payload
+from malta.simulation.experiments.payloads import FINENESS, flown_payload, held_payload, payload
 from malta.synthesis.requirements import Payload
 
 pytestmark = pytest.mark.usefixtures("proven_once")

@@ -13,8 +13,8 @@ import pytest
 from conftest import ROOT, refusal
 
 import malta
+from malta.loops.noise import noise_of
 from malta.loops.sampled_loops import machine_loop
-from malta.loops.time_domain import noise_of
 from malta.machines.tubular.requirements import REQUIREMENTS
 from malta.synthesis.requirements import GENERIC_REQUIREMENTS, requirements_for
 from malta.synthesis.spec import Loads, Pid, Spec

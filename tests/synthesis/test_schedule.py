@@ -17,7 +17,7 @@ from malta.gains.certified import origin_of
 from malta.gains.encodings import content_sha256, encode
 from malta.linear.closed_loops import instability
 from malta.linear.sampling import sample
-from malta.loops.sampled_loops import machine_system
+from malta.loops.parametric_loops import machine_system
 from malta.margins.scheduled_loops import loops_between_places
 from malta.margins.travel import travel_margin
 from malta.margins.worst_case import worst_sensitivities

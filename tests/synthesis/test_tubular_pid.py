@@ -29,10 +29,10 @@ from malta.synthesis.law import law
 from malta.synthesis.pid import axes_of, pid
 from malta.synthesis.spec import Pid
 from malta.tuning.judging import judge
+from malta.tuning.outcomes import SynthesizedDesign
 from malta.tuning.pid import CORNER_TOLERANCE, close_loop, estimates_of, name_of, outputs_of, parts_of
 from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import SynthesizedDesign
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,14 +18,15 @@ from conftest import ROOT, Run, refusal
 import malta
 from malta import gains, report
 from malta.linear.matrices import eigenvalues
+from malta.loops.noise import noise_of, noise_variance
 from malta.loops.sampled_loops import machine_loop
-from malta.loops.time_domain import noise_of, noise_variance
 from malta.machines.tubular.requirements import DRIVE
 from malta.margins.loop_report import BANDWIDTHS, Outcome
 from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.linear_law import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.tuning import tune as lqg
+from malta.tuning.design_text import design_text
 from malta.tuning.groups import figures_of
 from malta.tuning.judging import judge
 from malta.tuning.search import Effort, Journal, Trial, apply_trial, at_least_of, merge
@@ -33,7 +34,6 @@ from malta.tuning.tune import (
     TuningResult,
     cluster_search,
     clusters_of,
-    design_text,
     problem_sha256,
     tune as tuned,
     worst_ratio,

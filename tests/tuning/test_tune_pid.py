@@ -21,12 +21,13 @@ from malta.linear.sampling import sample, sample_noise
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.halbach import electronics, plant as halbach
 from malta.synthesis.spec import Pid
-from malta.tuning import pid, verify
+from malta.tuning import outcomes, pid
+from malta.tuning.design_text import design_text
 from malta.tuning.judging import judge
 from malta.tuning.pid import close_loop, goal_value, parts_of
 from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
 from malta.tuning.search import Effort, Journal, TrialSearch, model_and_controller, separate
-from malta.tuning.tune import design_text, problem_sha256, tune as tuned
+from malta.tuning.tune import problem_sha256, tune as tuned
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -341,8 +342,8 @@ def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyP
         bound: Any = SimpleNamespace(lower=1.25)
         return replace(linear_report(model, controller), robust=bound)
 
-    linear_report: Callable[..., LoopReport] = vars(verify)["linear_report"]
-    monkeypatch.setattr(verify, "linear_report", proven)
+    linear_report: Callable[..., LoopReport] = vars(outcomes)["linear_report"]
+    monkeypatch.setattr(outcomes, "linear_report", proven)
     rows = {r.name: r for r in judge(spec)}
     assert rows["margin"].ratio == 0.8
     assert rows["bandwidth"].at_least

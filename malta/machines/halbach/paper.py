@@ -25,8 +25,9 @@ from malta.machines.halbach.open_loop import (
 )
 from malta.machines.halbach.plant import Parameters
 from malta.margins.loop_report import LoopReport
-from malta.model.data import published_value, read
+from malta.model.data import read
 from malta.model.linearize import LinearModel
+from malta.model.printed import published_value
 from malta.report.ledger import Row, case_merit, machine_share, merit, peak_sensitivity, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.synthesis.controller import Controller

@@ -21,7 +21,7 @@ from malta.machines.planar.motions import (
     steps_ahead,
 )
 from malta.margins.loop_report import LoopReport
-from malta.model.data import published_value
+from malta.model.printed import published_value
 from malta.report.ledger import ZONE_NOTE, Row, case_merit, machine_share, merit, peak_sensitivity, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.trajectory import Trajectory

@@ -21,7 +21,7 @@ import numpy as np
 
 from malta.linear.uncertain import UncertainSystem
 from malta.machines.tubular.parameters import Parameters
-from malta.model.data import published_figures, published_value
+from malta.model.printed import published_figures, published_value
 from malta.proof.blocks import Dynamic
 
 FREE_BEAM_ROOT = 4.730040744862704  # k of the first mode of a free beam

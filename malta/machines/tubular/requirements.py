@@ -14,18 +14,14 @@ from malta.model.plant import Plant
 from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.scenario import ESTIMATORS, Scenario
 from malta.simulation.simulate import fits_kalman_filter
-from malta.synthesis.requirements import (
-    SEEDS,
-    Design,
-    Figure,
-    Requirement,
-    TrialFigures,
+from malta.synthesis.machine_requirements import (
     force_noise_of,
     mean_over_seeds,
     motion_of,
     reached_with_every_seed,
     worst_merit,
 )
+from malta.synthesis.requirements import SEEDS, Design, Figure, Requirement, TrialFigures
 from malta.synthesis.spec import Law
 
 DRIVE = "K_D"  # the force constant of the drive, which scales the thrust and no other force

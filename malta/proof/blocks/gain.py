@@ -19,6 +19,7 @@ import numpy as np
 from malta.arguments import positive
 from malta.arrays import ComplexArray, FloatArray
 from malta.bound import Bound, at_least, at_most
+from malta.budget import Budget, in_rounds
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.linear.open_loops import responses
@@ -56,7 +57,7 @@ from malta.proof.margin import Margin, Ranges, unproven
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven
 from malta.proof.problem import OfLoop, is_nominal_stable
 from malta.proof.robust import law_of, problem_of
-from malta.work import Budget, WorkUp, in_rounds, is_past, work_limit
+from malta.work import WorkUp, is_past, work_limit
 
 # Unmodelled dynamics beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
 #

@@ -17,8 +17,8 @@ from malta.display import micro as micro, number as number
 from malta.errors import InputError
 from malta.files import PICTURES, require_suffix
 from malta.merits import ROOTS
-from malta.model.data import published_value
 from malta.model.plant import Plant
+from malta.model.printed import published_value
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit

@@ -14,7 +14,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
-from malta.loops.sampled_loops import LAST_STAGE
+from malta.loops.windings import LAST_STAGE
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
 from malta.merit_lists import in_groups
 from malta.merits import Merit

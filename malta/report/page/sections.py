@@ -16,10 +16,10 @@ from rich.text import Text
 
 from malta.arrays import FloatArray
 from malta.files import version
-from malta.loops.time_domain import budget_of
+from malta.loops.noise import budget_of
 from malta.merits import four_digits
-from malta.model.data import published_figures
 from malta.model.plant import Signal
+from malta.model.printed import published_figures
 from malta.report.figures.drawing import micro
 from malta.report.page.analysis import Analysis, design_entries, display_unit, summary_sentences
 from malta.report.tables.campaign import box_text, campaign_tables, run_text

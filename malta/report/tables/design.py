@@ -17,9 +17,9 @@ from malta.checker.file import StabilityClaim, double, inside
 from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, Recovery, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
-from malta.model.data import published_value
 from malta.model.linearize import LinearModel
 from malta.model.parameters import box_words
+from malta.model.printed import published_value
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table
@@ -380,7 +380,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
-    >>> from malta.tuning.verify import Outcome
+    >>> from malta.margins.loop_report import Outcome
     >>> margin = Outcome("margin", 3.0, 3.6, "1", "proven over the travel", at_least=True)
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements

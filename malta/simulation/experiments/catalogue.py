@@ -26,9 +26,8 @@ and, where they differ from the defaults,
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from numbers import Real
 from typing import Any
@@ -37,12 +36,9 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.errors import CheckError, InputError
-from malta.model.equilibrium import balance, with_command
-from malta.model.parameters import units_of
-from malta.model.places import place_states, position_in
+from malta.errors import InputError
+from malta.model.places import place_states
 from malta.model.plant import Plant, Signal
-from malta.model.plants import plant_of
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -62,10 +58,9 @@ from malta.simulation.experiments import (
 from malta.simulation.layout import fidelities
 from malta.simulation.references import Motion, Reference
 from malta.simulation.scenario import Scenario
-from malta.simulation.simulate import EngineOf, simulate
+from malta.simulation.simulate import EngineOf
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-from malta.synthesis.requirements import Payload
 from malta.units import FINE_UNITS
 
 # Experiments of any machine: hold still, step an output, push.
@@ -79,11 +74,6 @@ from malta.units import FINE_UNITS
 
 SAMPLES = 2000  # of a run without a `time`
 LEAD_SHARE = 0.1  # share of the run before a step or a load
-WITNESS_SHARES = (0.95, 1.05)  # of the way to a witness: inside the margin and beyond it
-LEAVING_FACTOR = 5.0  # times its push: a machine beyond the margin is shown until it has left so far
-MAX_SAMPLES = 64_000  # samples of such a run
-HELD_SHARE = 0.98  # of a witness at an end of the travel, where a stop is touched
-PUSH: Mapping[str, float] = {"m": 2e-5, "rad": 2e-5}  # where these begin
 CLEARANCE = 0.1  # of a step of default size, as a share of the clearance
 SIZE = 1e-5  # SI, of a step of a machine without contacts and without noise
 
@@ -93,7 +83,7 @@ def hold_cases(
 ) -> list[PlannedRun]:
     """Hold still for `time` (s; 0: 2000 samples), with the noise of the sensors as built."""
     scenario = scenario_of(
-        "hold", _duration(controller, time), references.hold, _with_fidelity(plant, options)
+        "hold", _duration(controller, time), references.hold, with_fidelity(plant, options)
     )
     return [PlannedRun("hold", scenario, _rest_merits)]
 
@@ -113,7 +103,7 @@ def step_cases(
         signal, distance = plant.outputs[k], size or default_step(plant, k)
         reference = partial(jump, output=k, size=distance, at=LEAD_SHARE * duration)
         scenario = scenario_of(
-            "step", duration, reference, _with_exact_sensors(_with_fidelity(plant, options))
+            "step", duration, reference, _with_exact_sensors(with_fidelity(plant, options))
         )
         planned.append(PlannedRun(signal.name, scenario, partial(_step_merits, output=k, size=distance)))
     return planned
@@ -139,7 +129,7 @@ def disturbance_cases(
         push = partial(
             step_wrench, column=k, size=size, at=LEAD_SHARE * duration, width=len(plant.disturbances)
         )
-        given = _with_exact_sensors(_with_fidelity(plant, options)) | {"disturbance": push}
+        given = _with_exact_sensors(with_fidelity(plant, options)) | {"disturbance": push}
         scenario = scenario_of("disturbance", duration, references.hold, given)
         planned.append(PlannedRun(plant.disturbances[k].name, scenario, _load_merits))
     return planned
@@ -179,72 +169,11 @@ def _choose(signals: Sequence[Signal], name: str, option: str) -> list[int]:
     return [names.index(name)]
 
 
-def witness_flights(plant: Plant, controller: Controller, witness: Mapping[str, float]) -> list[Case]:
-    """Fly the nonlinear machine with parameters inside a margin and beyond it, pushed a little at the beginning.
-
-    witness : values (SI) with which the linear loop is at its limit of stability; an output among them is where it is
-
-    Returns two runs, one inside and one beyond the margin, under the machine's loads. They begin beside rest: v0 of the
-    law is what holds the machine there, as its integrals find it.
-
-    Example: `witness_flights(plant, controller, margin.witness)[1].run.verdict`
-    """
-    samples, beyond = SAMPLES, _fly_beside(plant, controller, witness, WITNESS_SHARES[1], SAMPLES)
-    while beyond.verdict.completed and not _leaves(beyond) and samples < MAX_SAMPLES:
-        samples *= 2
-        beyond = _fly_beside(plant, controller, witness, WITNESS_SHARES[1], samples)
-    inside = _fly_beside(plant, controller, witness, WITNESS_SHARES[0], samples)
-    sides = zip(("inside", "beyond"), WITNESS_SHARES, (inside, beyond), strict=True)
-    return [Case(f"{side} the margin, at {100 * share:.0f} % of it", run, ()) for side, share, run in sides]
-
-
-def _fly_beside(
-    plant: Plant, controller: Controller, witness: Mapping[str, float], share: float, samples: int
-) -> Trajectory:
-    """A run of the machine at a share of the way from its own parameters to a witness."""
-    held = {
-        signal.name: HELD_SHARE * witness[signal.name] for signal in plant.outputs if signal.name in witness
-    }
-    own: Any = plant.parameters
-    ends = {name: value for name, value in witness.items() if hasattr(own, name)}
-    there = plant_of(
-        replace(own, **{name: (1 - share) * getattr(own, name) + share * end for name, end in ends.items()})
-    )
-    start = {s.name: held.get(s.name, 0.0) + PUSH[s.unit] for s in plant.design_states if s.unit in PUSH}
-    options: dict[str, Any] = {"start": start} | _with_fidelity(plant, {})
-    at = there.at(**{name: value for name, value in held.items() if name in {s.name for s in there.states}})
-    controller = settle_feedforward(controller, there, at.x)
-    duration = samples * controller.sample_time
-    return simulate(
-        there, controller, scenario_of("witness", duration, partial(_hold_at, outputs=held), options)
-    )
-
-
-def settle_feedforward(controller: Controller, plant: Plant, x: FloatArray) -> Controller:
-    """The law with v0 moved by what its integrals add until a machine rests at the states x. Raises CheckError."""
-    wanted = with_command(plant, balance(plant, x), plant_of(controller.parameters)).v
-    known = controller.feedforward
-    held = known.at(position_in(plant, x))
-    if known.position.size:
-        held = held + known.position @ x[list(plant.controlled)][: known.position.shape[1]]
-    return replace(controller, feedforward=replace(known, v0=known.v0 + (np.asarray(wanted) - held)))
-
-
-def _hold_at(plant: Plant, outputs: Mapping[str, float]) -> Reference:
-    return references.hold(plant, **outputs)
-
-
-def _leaves(run: Trajectory) -> bool:
-    """Whether the deviation at the end is many times that of the beginning."""
-    off, tenth = np.abs(run.p - run.reference).max(axis=1), max(len(run.p) // 10, 1)
-    return bool(off[-tenth:].max() > LEAVING_FACTOR * off[0])
-
-
 def _duration(controller: Controller, time: float) -> float:
     return time or SAMPLES * controller.sample_time
 
 
-def _with_fidelity(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
+def with_fidelity(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
     """The options with the default fidelity: "dq" for machines with windings, else "force"."""
     return {"fidelity": "dq" if "dq" in fidelities(plant) else "force"} | dict(options)
 
@@ -455,82 +384,3 @@ def _expected_kind(value: Any, default: Any) -> str:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
-
-
-# The payload of a machine, bounded by statics and by flight.
-#
-# statics   at rest the commanded forces stay within their limits, anywhere in the travel
-# flight    the machine's experiment `payload` ends without touchdown: the mass is picked up and moved
-#
-# The mass margin of the linear loop (margins/verify.py) knows no limits of forces and no clearances, and is far larger.
-
-
-PAYLOAD = "payload"  # name of the experiment
-PLACES_OF_REST = (-1.0, 0.0, 1.0)  # of the travel
-MAX_PAYLOAD = 1e6  # kg; what holds that is not limited by its forces
-UNREACHED_SHARE = 2.0  # share of a limit, beyond it, where no command makes the forces
-FINENESS = 0.02  # of a mass: how finely the flight is bisected
-
-
-def payload(plant: Plant, controller: Controller) -> Payload | None:
-    """Bound the payload of a machine; None for a machine without a mass m.
-
-    >>> import malta
-    >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> found = payload(malta.plant_of(controller.parameters), controller)
-    >>> f"forces hold {found.held:.1f} kg, the mover carries {found.carried:.1f} kg"
-    'forces hold 3.6 kg, the mover carries 0.7 kg'
-    """
-    if "m" not in units_of(plant.parameters):
-        return None
-    held = held_payload(plant)
-    return Payload(held, *flown_payload(plant, controller, held))
-
-
-def held_payload(plant: Plant) -> float:
-    """Find the mass, kg, at which a force reaches its limit at rest in the middle or at an end of the travel."""
-    par: Any = plant.parameters
-    limits = np.array(plant.actuator.force_limit)
-    stroke = plant.stroke
-    places = [{stroke.name: share * stroke.travel} for share in PLACES_OF_REST] if plant.has_stroke else [{}]
-
-    def share_used(extra: float) -> float:
-        heavier = plant.variant(replace(par, m=par.m + extra))
-        try:
-            held = [balance(heavier, plant.state(at)).v for at in places]
-        except CheckError:  # no command makes these forces
-            return UNREACHED_SHARE
-        return float(np.abs(np.array(held) / limits).max())
-
-    if share_used(0.0) >= 1:
-        return 0.0
-    from scipy.optimize import brentq  # here: it takes long to load
-
-    high = par.m
-    while share_used(high) < 1:
-        high *= 2
-        if high > MAX_PAYLOAD:
-            return math.inf
-    return float(brentq(lambda extra: share_used(extra) - 1, 0.0, high, xtol=1e-9))
-
-
-def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[float, float]:
-    """Find the largest mass, kg, up to `most` that the experiment `payload` carries, and the smallest that it drops."""
-    if PAYLOAD not in setting(plant, "EXPERIMENTS", {}):
-        return math.nan, math.inf
-
-    def carries(mass: float) -> bool:
-        return experiment(PAYLOAD, plant, controller, masses=(mass,)).cases[0].run.verdict.completed
-
-    return largest_mass(carries, most if math.isfinite(most) else MAX_PAYLOAD)
-
-
-def largest_mass(carries: Callable[[float], bool], most: float) -> tuple[float, float]:
-    """Find the largest mass, kg, up to `most` that is carried, by bisection, and the smallest that is not."""
-    if carries(most):
-        return most, math.inf
-    low, high = 0.0, most
-    while high - low > FINENESS * high and high > 1e-6 * most:
-        middle = (low + high) / 2
-        low, high = (middle, high) if carries(middle) else (low, middle)
-    return low, high

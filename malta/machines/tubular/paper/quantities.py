@@ -21,31 +21,34 @@ from malta.identification.learn import learn
 from malta.identification.log import log_of
 from malta.linear.matrices import add_integrals
 from malta.loops.loop import loop_of_model
+from malta.loops.noise import noise_of
 from malta.loops.parametric_plants import of_plant
-from malta.loops.time_domain import PLACES, Deviation, noise_of, recovery
+from malta.loops.time_domain import PLACES, Deviation, recovery
 from malta.machines.tubular.drive import AXES, to_axes
 from malta.machines.tubular.experiments.disturbances import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke, stroke_merits
 from malta.margins.loop_report import LoopReport
 from malta.margins.verify import compensators
-from malta.model.data import published_value, read
+from malta.model.data import read
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plants import plant_of
+from malta.model.printed import published_value
 from malta.proof.robust import robust_margin
 from malta.report.ledger import Chance, bandwidth, proven_share, run_design
 from malta.simulation.current_control import link_voltage, open_loop_gain
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
-from malta.simulation.experiments.catalogue import experiment, flown_payload, held_payload, largest_mass
+from malta.simulation.experiments.catalogue import experiment
+from malta.simulation.experiments.payloads import flown_payload, held_payload, largest_mass
 from malta.simulation.flown_strokes import StrokeFigures, stroke_figures
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
+from malta.synthesis.calibration import calibrate
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import static_feedforward
 from malta.synthesis.regulators import lqr
 from malta.synthesis.spec import Spec
-from malta.synthesis.tunable_lqg import calibrate
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
