@@ -7,7 +7,20 @@ curves, locus         responses, poles, zeros; root loci
 time_domain           answers to references and loads, and what noise leaves at rest
 """
 
-from malta.loops.curves import LoopCurves as LoopCurves, loop_curves as loop_curves
-from malta.loops.linear_loops import LoopSystems as LoopSystems, loop_systems as loop_systems
-from malta.loops.loop import Loop as Loop
-from malta.loops.time_domain import Recovery as Recovery, recovery as recovery
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.loops.curves import LoopCurves as LoopCurves, loop_curves as loop_curves
+    from malta.loops.linear_loops import LoopSystems as LoopSystems, loop_systems as loop_systems
+    from malta.loops.loop import Loop as Loop
+    from malta.loops.time_domain import Recovery as Recovery, recovery as recovery
+
+_NAMES = {
+    "malta.loops.curves": "LoopCurves loop_curves",
+    "malta.loops.linear_loops": "LoopSystems loop_systems",
+    "malta.loops.loop": "Loop",
+    "malta.loops.time_domain": "Recovery recovery",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

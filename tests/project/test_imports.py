@@ -154,3 +154,24 @@ def test_type_checkers_see_the_names_that_are_loaded(package: str) -> None:
     assert [(place, name, name) for place, names in module._NAMES.items() for name in names.split()] == seen
     for _, name, _ in seen:
         assert getattr(module, name) is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "others"),
+    [
+        ("simulate", ("loops", "proof", "margins", "gains")),
+        (
+            "loop",
+            ("proof", "margins", "simulation", "loops.curves", "loops.linear_loops", "loops.time_domain"),
+        ),
+        ("campaigns.Plan", ("proof", "margins", "campaigns.rare", "campaigns.studies", "campaigns.summary")),
+        ("structured.h_infinity", ("proof", "model", "loops", "structured.rounds")),
+    ],
+)
+def test_a_public_name_loads_what_it_needs(name: str, others: tuple[str, ...]) -> None:
+    """A package loads its other names where they are asked for."""
+    code = f"import sys, malta; malta.{name}; print(*(m for m in sys.modules if m.startswith('malta.')))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = done.stdout.split()
+    assert len(loaded) > 10
+    assert [one for one in loaded for other in others if f"{one}.".startswith(f"malta.{other}.")] == []
