@@ -19,6 +19,7 @@ extensions = [
     "sphinx_design",
     "sphinx.ext.autodoc",
     "links",  # these are of _extensions
+    "llms",
     "mathml",
     "reference",
 ]

@@ -14,8 +14,10 @@ from typing import Any
 import pytest
 from conftest import ROOT
 from docstrings import to_rest
+from docutils import nodes
 from gallery import FOLDER, cards, few_colours
 from links import broken_links
+from llms import Entry, first_sentence, llms_text
 from PIL import Image
 from public import all_names, docstring_of, names_of
 from typer.main import get_command
@@ -134,6 +136,29 @@ def test_broken_links_are_found(tmp_path: Path) -> None:
     ]
 
 
+def test_llms_txt_has_a_line_for_a_page() -> None:
+    pages = [
+        Entry("Margins", "howto/margin.html", "A proven margin."),
+        Entry("Theory", "theory/index.html", ""),
+    ]
+    assert llms_text("malta", "Controllers.", {"Use": pages}) == (
+        "# malta\n\n> Controllers.\n\n## Use\n\n"
+        "- [Margins](howto/margin.html): A proven margin.\n- [Theory](theory/index.html)\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [("It is 1.5 m.\nIt is proven.", "It is 1.5 m."), ("How far? So far.", "How far?"), ("A list:", "A list")],
+)  # fmt: skip
+def test_the_line_of_a_page_is_its_first_sentence(text: str, line: str) -> None:
+    page: Any = nodes.document(None, None)
+    page += nodes.section(
+        "", nodes.title("", "Page"), nodes.paragraph("", text), nodes.paragraph("", "Later.")
+    )
+    assert first_sentence(page) == line
+
+
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Every link within it leads to its place; it holds every name, the schemas, and nothing from a network."""
@@ -147,6 +172,10 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     known = {found for text in pages.values() for found in re.findall(r'id="(malta\.[\w.]+)"', text)}
     assert set(all_names()) <= known
     assert json.loads((tmp_path / "site" / "schemas" / "gain.json").read_text())["title"] == "malta gain file"
+    listed = re.findall(
+        r"^- \[.+\]\((.+)\.html\)", (tmp_path / "site" / "llms.txt").read_text("utf-8"), re.MULTILINE
+    )
+    assert sorted([*listed, "index"]) == sorted(str(page.relative_to(DOCS).with_suffix("")) for page in PAGES)
 
 
 def test_every_card_of_the_gallery_has_a_command_and_small_pictures() -> None:
