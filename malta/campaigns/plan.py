@@ -242,10 +242,10 @@ class Plan:
     parameters : of the machine in the middle of the box; None: those that the controller was designed for
     case : label of one of the scenario's cases; None: the first
     options : of the scenario, SI, as {"duration": 0.1}; noise is 1 (sensors as built) unless it is given
-    law : "own", or "c" and "c-float": the exported C flies, in double or single precision
+    law : "own", or "c" and "c-float": the exported C runs, in double or single precision
 
-    Raises InputError for an unknown scenario, case, option, parameter or error of a sensor, for a spread outside 0 to
-    1, and for a scenario that changes the machine on the way.
+    Raises InputError for an unknown scenario, case, option, parameter or error of a sensor, and for a spread outside 0
+    to 1. It also refuses a scenario that changes the machine during the run.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")

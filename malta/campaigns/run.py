@@ -100,9 +100,9 @@ def campaign(
 
     Returns a Campaign. After Ctrl-C it has the blocks that are done, and says `interrupted`.
 
-    Raises InputError for more than IN_MEMORY runs, which `malta.campaigns.summarize` takes; for a folder that has
-    another campaign or cannot be written to, and for a scheduler that does not answer; blocks that are done stay in
-    the folder.
+    Raises InputError for more than IN_MEMORY runs, which `malta.campaigns.summarize` takes, for a folder that has
+    another campaign or cannot be written to, and for a scheduler that does not answer. Completed blocks stay in the
+    folder.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")

@@ -146,7 +146,7 @@ def _own_step(native: Native, state: Any) -> Step:
 def engine_of_c(
     precision: Precision = "double", step_of: StepOf = _own_step
 ) -> Callable[[Prepared, Plant, float], Engine]:
-    """Make the engine with which `malta.simulate` flies the exported C in place of the control law.
+    """Make the engine with which `malta.simulate` runs the exported C in place of the control law.
 
     The machine, its sensors and the delay are those of every simulation; the law, the current loops and their memory
     are the compiled controller's.
@@ -156,8 +156,8 @@ def engine_of_c(
 
     Returns a function for the argument `engine` of `malta.simulate` and `malta.simulation.simulate_many`.
 
-    Raises InputError without a C compiler, and for what the export does not have: another estimator, C at the measured
-    position, axes that turn, forces known in advance, an open loop.
+    Raises InputError without a C compiler, and for what the export does not have. That is another estimator, C at the
+    measured position, axes that turn, forces known in advance, or an open loop.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")

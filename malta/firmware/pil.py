@@ -317,8 +317,8 @@ def replay_on_target(
 
     Returns what the target made of them.
 
-    Raises InputError for a port that cannot be used, a target that is silent or whose frames are garbled, that was
-    exported from another gain file, or whose compiler changed its arithmetic.
+    Raises InputError for a port that cannot be used, and for a target that is silent or whose frames are garbled. It
+    also refuses C that was exported from another gain file, and a compiler that changed its arithmetic.
 
     >>> import malta
     >>> try:

@@ -56,9 +56,9 @@ def read(path: str | Path) -> Controller:
     Returns the Controller in it.
 
     Raises InputError, naming file and field: not such a file, another schema or version, a missing or extra entry, a
-    wrong shape, NaN or infinity, a non-positive sample time, content that does not match its sha256, gains that do not
-    stabilize the file's own model. A PID or a law of errors has no model: `malta.verify` and all commands refuse gains
-    that do not stabilize the loop on the file's own machine.
+    wrong shape, NaN or infinity, a non-positive sample time. It also refuses content that does not match its sha256,
+    and gains that do not stabilize the file's own model. A PID or a law of errors has no model: `malta.verify` and all
+    commands refuse gains that do not stabilize the loop on the file's own machine.
 
     >>> import malta
     >>> malta.gains.read("design/gains/planar.json")

@@ -83,10 +83,10 @@ def contraction(controller: Controller, box: Mapping[str, float], *, time: float
         c = sup of |1 - 0.8 T(e^jwTs; p) / T_0(e^jwTs)|      over all frequencies and all parameters of the box
 
     bounds the 2-norm of what `next_stroke` leaves of an error that thrust can make, where it learns with its full
-    gain; with a share s of it, 1 - s (1 - c) does. It covers the linear sampled loop at the operating point with the
-    slope of its loads there, not that of places along the stroke; not saturation, not noise that differs from stroke
-    to stroke, and no response that goes on after the log has ended. By how much V misses the inverse of T_0 is proven
-    too, and counted in.
+    gain. With a share s of this gain, 1 - s (1 - c) is the bound. It covers the linear sampled loop at the operating
+    point with the slope of its loads there, not that of positions along the stroke. It does not cover saturation, noise
+    that differs from stroke to stroke, or a response that goes on after the log has ended. By how much V misses the
+    inverse of T_0 is proven too, and included.
 
     controller : the gain file
     box : parameters with shares of their values, as {"m": 0.2}

@@ -57,7 +57,7 @@ class ExcitationPlan:
     signal : the multisine
     periods : that are logged, after one in which the loop settles
     motion : by output: largest deviation, SI
-    window : by output: twice that and five deviations of its noise, SI: a reading beyond it should end the flight
+    window : by output: twice that and five deviations of its noise, SI: a reading beyond it should end the run
     current : by measured current: largest deviation from the current at rest, A
     command : by input: the largest command, with the one that holds the machine, as a share of its limit
     accuracy : by parameter: half of the 95 % interval that the log will give, as a share of its value
@@ -115,7 +115,7 @@ def excite(
     """Design an excitation of all axes at once, and predict from the linear loop what it does and what it will find.
 
     Each input has lines of its own, evenly spread in log f, with phases of a low crest factor. The amplitude of an axis
-    is the same at all of its lines. Where none is given, the band follows that of the loop, see `default_band`, and a
+    is the same at all of its lines. Where none is given, the band follows that of the loop, see `default_band`. A
     period has two turns of the lowest line and room for all lines, in whole samples.
 
     loop : the machine under its controller, where it is held
@@ -133,8 +133,8 @@ def excite(
 
     Returns an ExcitationPlan.
 
-    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, an unstable
-    loop, and a machine without limits where no size is given.
+    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, and an
+    unstable loop. A machine without limits is refused where no size is given.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")

@@ -90,7 +90,7 @@ class Identified:
     whiteness : correlation of neighbouring lines' residuals in standard deviations
     distortion : power at multiples of 1 / period that were not excited, over the noise; 1 of a linear machine
     by_output : chi2 of each output
-    dropped : parameters that this log does not tell by themselves, with their standard deviation as a share
+    dropped : parameters that this log does not determine by themselves, with their standard deviation as a share
     in_time : the same parameters from prediction errors in time; None where the machine's sensors lag, or its states
         are not (q, q')
     explained : where chi2 is above its limit: what a change of each parameter that was taken as known would explain, as
@@ -217,19 +217,19 @@ def identify(
 
         sum over k of e_k^H C_k(theta)^-1 e_k,      C_k: covariance of the same e between the lines
 
-    in which C moves with theta: so the noise that the loop feeds back into the currents does not bias the result
-    (maximum likelihood with errors in the variables; Pintelon and Schoukens, System Identification, 2nd ed., ch. 9).
+    in which C depends on theta. So noise that the loop feeds back into the currents does not bias the result. This is
+    maximum likelihood with errors in the variables (Pintelon and Schoukens, System Identification, 2nd ed., ch. 9).
     Loads act at the place where the log was made, with the mean currents there. What the machine's curvature adds at
-    the lines is computed from the measured motion and taken off.
+    the lines is computed from the measured motion and subtracted.
 
     Then the same parameters are estimated from prediction errors in time (`malta.identification.prediction`), with the
     process noise that is found between the lines. Both are reported; a model that lacks something makes them differ.
     A machine whose sensors lag, or whose states are not (q, q'), is estimated at the lines alone.
 
-    controller : the gain file that flew; its machine's parameters are where the search starts
+    controller : the gain file that was running; its machine's parameters are where the search starts
     log : with measured currents and an excitation of whole periods
-    parameters : names of the machine's record or of its sensors' errors; (): those that the log tells to 50 %, but for
-        masses and lengths, which are held
+    parameters : names of the machine's record or of its sensors' errors; (): those that the log determines to 50 %,
+        but for masses and lengths, which are held
     known : parameters with values that were weighed or measured otherwise, SI
     start : values from which the search starts, SI
     robust : take outliers among the readings for missing, with Student's likelihood in time
@@ -291,15 +291,15 @@ def weigh(
 ) -> Identified:
     """Identify parameters from two logs of a machine, with and without a known mass on it: so its own mass comes out.
 
-    One log tells ratios such as K_A / m. With a mass d the second one tells K_A / (m + d), and both together K_A and m.
+    One log determines ratios such as K_A / m, with a mass d the second one K_A / (m + d), both together K_A and m.
     The likelihood at the lines is that of both logs together, as `identify` has it for one; nothing is estimated in
     time.
 
-    controller : the gain file that flew both
+    controller : the gain file that was running in both
     log : without the added mass
     loaded : with it
     added : what it adds to parameters, SI, as {"m": 0.1}; on the centre of gravity it adds no inertia
-    parameters : as for `identify`; (): those that both logs tell to 50 %, and those of `added`
+    parameters : as for `identify`; (): those that both logs determine to 50 %, and those of `added`
     known : parameters with values that were weighed or measured otherwise, SI
 
     Returns an Identified of the machine without the added mass, also where its `refusal` says that the model does not

@@ -74,13 +74,13 @@ def learn_v0(controller: Controller, log: Log) -> LearnedV0:
 
         sum of phi_i (f - v0(z)) - m sum of phi_i'' z = sum over j of c_j sum of phi_i phi_j,   v0 += sum of c_j phi_j
 
-    with the thrust f that the law believes the measured currents to make (without currents in the log: its command),
-    splines phi_j(z*(t)) along the reference, which are instruments, and the sum of phi z'' by parts: readings are not
-    differentiated. Friction is in it unless the log goes there and back. Law, filter and exported C read the table at
-    the reading of the stroke; outside of the places that the log has seen the change goes on as at the last of them.
+    with the thrust f that the law computes from the measured currents (without currents in the log: its command).
+    The splines phi_j(z*(t)) along the reference are instruments. The sum of phi z'' is taken by parts: readings are
+    not differentiated. Friction is in it unless the log goes there and back. Law, filter and exported C read the table
+    at the reading of the stroke. Outside of the positions in the log, the change is that at the last of them.
     A second log under the new gain file corrects what is left. Learn the force constant first, as m z'' counts.
 
-    controller : the gain file that flew
+    controller : the gain file that was running
     log : of a slow stroke, or several, that begins and ends at rest; whole or a part of the travel
 
     Returns a LearnedV0; its controller is named NAME_learned.
@@ -153,7 +153,7 @@ class Learned:
     factor : command that was needed over the command that the law's machine needs; above 1 where the drive is weaker
     deviation : standard deviation of the factor by the noise of the position sensor
     parameter : the force constant of the thrust, by name; "": none scales the thrust alone, and none was named
-    before, after : its value in the gain file, and the value that the log tells, SI; 0 without a parameter
+    before, after : its value in the gain file, and the value from the log, SI; 0 without a parameter
     controller : the law with that value
 
     >>> import dataclasses, malta
@@ -192,18 +192,18 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
 
         g = sum of (f - v0) a_ref / (m sum of z'' a_ref)
 
-    with the thrust f that the law believes the measured currents to make (without currents in the log: its command),
-    the force v0(z) that holds the mover at its reading, and the acceleration a_ref of the reference, which is an
-    instrument: neither noise nor the error of the stroke biases g. The sum of z'' a_ref is that of z a_ref'', by parts.
-    Of a machine whose currents are held between readings, what its own stroke takes beside 1 is taken off g.
-    The law commutates with a force constant K, and its filter predicts from the force that it believes to send; so
+    with the thrust f that the law computes from the measured currents (without currents in the log: its command). v0(z)
+    holds the mover at its reading. The acceleration a_ref of the reference is an instrument: neither noise nor the
+    error of the stroke biases g. The sum of z'' a_ref is that of z a_ref'', by parts.
+    Where currents are held between readings, the factor of the model's own stroke beside 1 is taken off g.
+    The law commutates with a force constant K, and its filter predicts from the force that it believes to send. So
     K / g corrects both, where another inertia in the feedforward corrects only one.
 
-    controller : the gain file that flew
+    controller : the gain file that was running
     log : of a stroke
     parameter : the force constant of the thrust; "": found by its effect on the machine
 
-    Returns a Learned; its controller has the new constant, or is the one that flew where no parameter scales the thrust
+    Returns a Learned; its controller has the new constant, or is the given one where no parameter scales the thrust
     alone, as where magnets make all forces.
 
     Raises InputError for a machine without a stroke, and for a log without one; CheckError for a factor out of reason,

@@ -179,7 +179,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     path : the file. Units are converted to SI; a cell that is empty or nan is a missing reading.
     groups : of its columns that are read, as ("y", "i"): of large files some take less time than all
 
-    Returns a Log. Signals of headings without a prefix are found by their unit when the log is used: positions and
+    Returns a Log. Signals of headings without a prefix are found by their unit when the log is used. Positions and
     angles are measured outputs, forces and torques commands, currents and voltages those of the axes.
 
     Raises InputError: no such file, another suffix, damage, headings that are no "name [unit]", times that do not rise.

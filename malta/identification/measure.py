@@ -194,7 +194,7 @@ def measure(
     The machine is held at the controller's operating point. Of a machine whose currents are commutated for the last
     reading and held, the loop is cut at the law's reading; commutation belongs to the machine.
 
-    controller : the gain file that flew
+    controller : the gain file that was running
     logs : with the excitation, whole periods of it; as many as inputs that excite each line in different inputs, or
         one whose lines excite one input each
     parameters : of the machine that is predicted; None: those of the controller
@@ -203,8 +203,8 @@ def measure(
 
     Returns a Measurement, also where its `refusal` says that the machine is not as predicted.
 
-    Raises InputError for signals or parameters of another machine, CheckError for logs that tell nothing: too short,
-    without a periodic excitation, lines of several inputs in too few logs, below the noise.
+    Raises InputError for signals or parameters of another machine. Raises CheckError for logs that tell nothing: too
+    short, without a periodic excitation, lines of several inputs in too few logs, below the noise.
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -298,14 +298,14 @@ class MeasurementPlan:
 def plan_measurement(
     loop: Loop, *, width: float | None = None, separate: bool = False, **options: Any
 ) -> MeasurementPlan:
-    """Plan the flights that measure a loop: excitation, length, and the bands and coherence to expect of them.
+    """Plan the runs that measure a loop: excitation, length, and the bands and coherence to expect of them.
 
-    Noise and steps n of the sensors leave S n in the readings, whose Fourier coefficients have the covariance
-    S diag(sigma^2) S^H / N in N samples; that goes through `measure` as a log's own does.
+    Noise and steps n of the sensors leave S n in the readings. Its Fourier coefficients have the covariance
+    S diag(sigma^2) S^H / N in N samples, which goes through `measure` as a log's own does.
 
     loop : the machine under its controller
     width : half of the widest 95 % band as a share of |S|, or of 1 where |S| is less; None: as the periods give it
-    separate : whether each line shall excite each input, in as many flights as inputs
+    separate : whether each line shall excite each input, in as many runs as inputs
     options : of `malta.excite`: force, current, motion, period, periods, band, lines, seed
 
     Returns a MeasurementPlan.

@@ -122,14 +122,14 @@ class LawReplay:
 def replay_law(controller: Controller, log: Log, *, same: bool | None = None) -> LawReplay:
     """Run a law on logged readings and compare what it commands, sample by sample.
 
-    The filter starts at rest at the first reference, as a run of `malta.simulate` does; a log that begins in flight
+    The filter starts at rest at the first reference, as a run of `malta.simulate` does. A log that begins in operation
     agrees once that start is forgotten, which the second half of the log shows. Derivatives of the reference are taken
     from its samples.
 
-    Where the commands are the log's, the gain file's own machine flies the same reference and excitation, with noise
-    and steps of its sensors. Innovations of the log that are larger than its, or correlated otherwise, are of another
-    machine: `refusal` says so, and which parameter would explain them. Filters that are weighted for robustness have
-    no white innovations on any machine; so these are what the log's are compared with, not white noise.
+    Where the commands are the log's, the gain file's own machine is simulated with the same reference and excitation,
+    with noise and steps of its sensors. Innovations of the log that are larger than its, or correlated otherwise, are
+    of another machine: `refusal` says so, and which parameter would explain them. Filters that are weighted for
+    robustness have no white innovations on any machine; so these are what the log's are compared with, not white noise.
 
     controller : the gain file
     log : with measured outputs, commands and reference

@@ -166,12 +166,12 @@ def next_stroke(
         d_(j+1) = d_j + B (H B)^+ U A_j U' e_j
 
     with the error e of the readings, the thrust d that was sent (the log's excitation), patterns B and the linear
-    loop's response H (lifted form of iterative learning; Bristow, Tharayil, Alleyne, IEEE Control Systems 26(3), 2006).
-    A_j has the gains of a Kalman filter over strokes, as on top of this module, with the noise that the log shows where
-    no pattern of thrust can move the mover. The filter of the law has to know d as sent, as
+    loop's response H. This is the lifted form of iterative learning (Bristow, Tharayil, Alleyne, IEEE Control Systems
+    26(3), 2006). A_j has the gains of a Kalman filter over strokes, as at the top of this module. The log shows the
+    noise where no pattern of thrust can move the mover. The filter of the law has to know d as sent, as
     `Scenario(excitation=...)` has it.
 
-    controller : the gain file that flew
+    controller : the gain file that was running
     log : of a stroke that begins and ends at rest
     patterns : of this law and reference, `thrust_patterns`; None: computed
     before : what the stroke before was found to leave; None: nothing is known, and the log alone weighs
@@ -280,7 +280,7 @@ class LearnedStrokes:
     """Strokes of a simulated machine, each sent what the ones before taught.
 
     axial_error : m, the largest true error of each stroke
-    without_noise : m, the same of each stroke flown again without noise of the sensors, and of the next one
+    without_noise : m, the same of each stroke simulated again without noise of the sensors, and of the next one
     patterns : of each stroke, how many patterns of its error rose above the noise
     thrust : k, N: what the next stroke would be sent beside the law's
     controller : the law with the force constant that the first stroke taught

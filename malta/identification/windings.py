@@ -51,7 +51,7 @@ MAX_DEAD_TIME = 20.0  # samples of dead time
 @display
 @dataclass(frozen=True, eq=False)
 class Windings:
-    """What a log tells of the drive.
+    """Parameters of the drive from a log.
 
     R : of each axis
     L : likewise
@@ -146,7 +146,7 @@ def held_response(theta: FloatArray, w: FloatArray, Ts: float) -> ComplexArray:
 def identify_windings(controller: Controller, log: Log) -> Windings:
     """R, L and the dead time of the drive from a log under excitation, with its voltages.
 
-    controller : the gain file that flew
+    controller : the gain file that was running
     log : with the measured currents and the commanded voltages of the axes, and whole periods of an excitation
 
     Returns a Windings, also where its `refusal` says that these three do not explain the currents.

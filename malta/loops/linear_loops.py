@@ -101,8 +101,8 @@ class LoopSystems:
 def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> LoopSystems:
     """Make python-control systems of a machine's loop; of a plant and a controller at the controller's operating point.
 
-    Currents that are held between samples hang on the last reading, too: at the sensors this is part of F, and broken
-    with it; P, F and what is taken at the forces have it in the machine.
+    Currents that are held between samples depend on the last reading, too. At the sensors this is part of F, and broken
+    with it. P, F and what is taken at the forces have it in the machine.
 
     plant : the machine, or its Loop at any operating point
     controller : of the plant; None: the Loop has it

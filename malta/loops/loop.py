@@ -42,13 +42,13 @@ from malta.synthesis.law import law_at
 @display
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A machine and its controller at an operating point: the derivative of the control period that simulations fly.
+    """A machine and its controller at an operating point: the derivative of the control period that simulations run.
 
         xi+ = Ad xi + Bd (v, r) + G w,   y = Cd xi,   (v, r) = F y        one sample, negative feedback inside F
 
     xi holds the machine's states, the windings' currents, the link's voltage under load, stored forces and readings;
-    r are readings on which held currents hang, w disturbances. Hold, delay, current loops, sensors and loads are exact.
-    What is not in it is named by `left_out`.
+    r are readings on which held currents depend, w disturbances. Hold, delay, current loops, sensors and loads are
+    exact. What is not in it is named by `left_out`.
 
     plant : the machine, with its parameters
     controller : its controller; of a schedule the law that it has there

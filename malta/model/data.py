@@ -74,8 +74,8 @@ def read(path: str | Path, preset: str | None = None) -> Any:
 
     Returns the record, whose fields are numbers in SI.
 
-    Raises InputError, which names file and field, for a missing, unknown or doubled key, an unknown preset, a wrong
-    unit, NaN, a value out of range, and a machine that is unknown or cannot be imported.
+    Raises InputError, which names file and field, for a missing, unknown or doubled key, an unknown preset, and a
+    machine that is unknown or cannot be imported. It also refuses a wrong unit, NaN, and a value out of range.
 
     >>> import malta
     >>> parameters = malta.read("data/tubular.toml")

@@ -96,12 +96,12 @@ class LinearModel:
 def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> LinearModel:
     """Linearize x' = f(x, u, w), y = h(x, u), u = forces(x, currents(y, v)) at an operating point.
 
-    The inputs of the model are commands: A, B and E are slopes of the whole chain from a command to the rates, at the
-    command v at which the inputs of the point act, whatever the controller believes.
+    The inputs of the model are commands: A, B and E are slopes of the whole chain from a command to the rates. They are
+    taken at the command v that makes the inputs of the point, whatever the controller believes.
 
     At `plant.at(z=...)` the loads are left out, because v0(z) cancels them. At `trim(plant, z=...)` they act, and the
-    model has the slopes of the loads and of the inputs that balance them (for the tubular machine m g / Ixx from z to
-    alpha'', the slope of the cogging in z'', and off the centre z f_D / Ixx in alpha'' and beta'').
+    model has the slopes of the loads and of the inputs that balance them. For the tubular machine these are m g / Ixx
+    from z to alpha'' and the slope of the cogging in z''. Off the centre there is z f_D / Ixx in alpha'' and beta''.
 
     plant : the machine
     point : the operating point, from `plant.at`, `plant.point` or `malta.trim`
@@ -110,8 +110,8 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
 
     Returns a LinearModel, exact derivatives by CasADi; its operating point has the command v.
 
-    Raises InputError when the point has the wrong size, CheckError when no command makes its inputs or the Jacobian is
-    not finite: without a `preload`, currents sqrt(v) have no slope at v = 0.
+    Raises InputError when the point has the wrong size. Raises CheckError when no command makes its inputs or the
+    Jacobian is not finite: without a `preload`, currents sqrt(v) have no slope at v = 0.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")

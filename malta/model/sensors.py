@@ -29,9 +29,9 @@ class Sensors:
 
         lag s' = p - s,     y(t) = s(t - dead_time)
 
-    Lags and dead time are exact in simulations, linear loops and proofs; only proofs that have PI current loops, which
-    read currents at once, take whole samples of dead time alone. The design model knows neither: a `delay` of the
-    design and the margin proven of the machine's loop account for them.
+    Lags and dead time are exact in simulations, linear loops and proofs. There is one exception: proofs with PI current
+    loops, which read currents at once, take only whole samples of dead time. The design model has neither: a `delay` of
+    the design and the margin proven of the machine's loop account for them.
 
     lag : s, of each output; 0.0: none; default: zero. A parameter of the machine may be among them, and vary in proofs.
     dead_time : s

@@ -45,8 +45,8 @@ def tune_design(
     """Tune the law of a design file for its [goals] and for its [specification], until the margin is proven.
 
     Of [specification] these are goals: the margin, the peak sensitivity, and noise of forces and motions at rest.
-    Others, as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, at
-    the ends of what proofs cover, as rest and full speed of a rotor, and at the design's operating point in all else.
+    Others, as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, and
+    at the ends of what proofs cover, as rest and full speed of a rotor. All else is at the design's operating point.
 
     spec : a design with [structure], from `malta.read_design`
     keep : leave numbers that hold all hard goals, with the proof, as they stand
@@ -55,8 +55,8 @@ def tune_design(
 
     Returns the `spec` with the numbers that were found, and `tuned`, what they reach and what is proven of them.
 
-    Raises InputError for another design, one without goals, and a structure that does not stabilize the machine;
-    CheckError where no law meets the hard goals, with two that hold each other.
+    Raises InputError for another design, one without goals, and a structure that does not stabilize the machine.
+    Raises CheckError where no law meets the hard goals, with two that conflict.
 
     >>> import malta
     >>> spec = malta.read_design("design/structured.toml")

@@ -126,7 +126,7 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     loop.
 
     Raises InputError for shapes that do not fit, inputs u that z does not weigh, outputs y without noise, and plants
-    that no law stabilizes; CheckError where the closed loop does not keep what the equations promise.
+    that no law stabilizes. Raises CheckError where the closed loop does not keep what the equations promise.
 
     >>> from malta import structured
     >>> D = [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
@@ -391,13 +391,13 @@ def _weight_of(weight: Any, field: str) -> System:
 def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     """Find the law that stands the largest uncertainty of normalized coprime factors of a shaped plant.
 
-    The shaped plant is G_s = W2 G W1, K = W1 K_s W2. gamma is sqrt(1 + rho(X Z)) in closed form, without a search, and
-    1 / gamma the margin: K holds (M + dM)^-1 (N + dN) for every |[dN dM]| below it, with G_s = M^-1 N.
+    The shaped plant is G_s = W2 G W1, K = W1 K_s W2. gamma is sqrt(1 + rho(X Z)) in closed form, without a search. The
+    margin is 1 / gamma: K stabilizes (M + dM)^-1 (N + dN) for every |[dN dM]| below it, with G_s = M^-1 N.
 
     plant : continuous, strictly proper control system
     before, after : W1 and W2, control systems or numbers
 
-    Returns a Synthesized, whose law takes the errors r - y: negative feedback; its norm is that of the four transfer
+    Returns a Synthesized, whose law takes the errors r - y: negative feedback. Its norm is that of the four transfer
     functions [K; 1] (1 + G K)^-1 [1 G] of the shaped plant.
 
     Raises InputError for a plant with D, and for equations without a solution.

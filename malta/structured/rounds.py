@@ -343,8 +343,8 @@ def tune(
 
     Returns a Tuned. Its `closed` and its `certificate` say whether the proofs hold what was asked for.
 
-    Raises InputError for elements that do not fit, and for a structure that was not found to stabilize the models;
-    CheckError where no law was found that meets all hard goals, with two that hold each other.
+    Raises InputError for elements that do not fit, and for a structure that was not found to stabilize the models.
+    Raises CheckError where no law was found that meets all hard goals, with two that conflict.
 
     Source: Apkarian and Noll, Nonsmooth H-infinity synthesis, IEEE TAC 51 (2006), for the kind of the search; the
     proofs are those of malta.proof.

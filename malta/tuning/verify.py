@@ -58,7 +58,7 @@ def verify(
         alone, worst cases, payload, requirements; otherwise the linear figures and the margin over the travel, in a
         fraction of the time; None: of a gain file
     spec : the design, whose [specification] is judged with `stages`; None: none
-    flights : whether requirements are judged that have to be flown
+    flights : whether requirements are judged that need a simulation
     current_loops : of the last stage: "pi", the controllers of the gain file on the windings, where a machine has some;
         "lag" ends at the stage `sampled`, with first-order lags at the crossover
     proof : False: without margins of parameters
@@ -69,9 +69,9 @@ def verify(
 
     Returns a LoopReport, which prints as a short table; its `figures` lists all figures of merit with their meaning.
 
-    Raises InputError for unknown parameters, and for what is no loop; CheckError when numbers overflow, no input holds
-    the machine, or its linear model at rest is not the machine's (`malta.inspect`). An unstable loop raises nothing: it
-    is not `stable`, and its peak sensitivities are NaN.
+    Raises InputError for unknown parameters, and for what is no loop. Raises CheckError when numbers overflow, no input
+    holds the machine, or its linear model at rest is not the machine's (`malta.inspect`). An unstable loop raises
+    nothing: it is not `stable`, and its peak sensitivities are NaN.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")

@@ -325,7 +325,7 @@ def _course_text(extent: Extent) -> str:
 def tolerance_table(found: LoopReport) -> Table:
     """Tabulate the proven range of each parameter alone, and its share in the margin of all together.
 
-    The mass margin is that of the linear loop; the payload below it is bounded by limits of forces and by flight.
+    The mass margin is that of the linear loop; the payload below it is bounded by limits of forces and by simulation.
 
     found : from `malta.verify`, with `stages`
 
