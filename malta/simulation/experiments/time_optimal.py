@@ -159,9 +159,8 @@ def fastest_stroke(
 
     Returns a FastestStroke: t (s), z (m), v (m/s), a (m/s2), i (A), u (V) at the nodes, with `rise` and `duration` (s).
 
-    Raises InputError for arguments that do not fit the plant. Raises CheckError when IPOPT finds no optimum, or when
-    the last mesh still changes T by 0.05 %. It also refuses an optimum whose equations, integrated between the nodes,
-    miss the next node or the limits.
+    Raises InputError for arguments that do not fit the plant. Raises CheckError without an optimum, when the last mesh
+    still changes T by 0.05 %, or when the equations, integrated between the nodes, miss the next one or the limits.
 
     >>> import malta
     >>> parameters = malta.read("data/tubular.toml")
