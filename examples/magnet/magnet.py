@@ -5,7 +5,7 @@
 q points up from the middle of the clearance, s is the gap there. L' q' i is the voltage that motion induces; with it
 the magnet converts what energy it is given: force = i^2 L' / 2. The state i counts from the current I = s sqrt(m g / C)
 that holds the sphere in the middle. The position is measured, and the current, from I as well, where `sensed` is 1:
-two measurements for one command.
+two measurements for one command. The range of the current's sensor is what all of the voltage makes at rest.
 """
 
 from dataclasses import dataclass
@@ -64,5 +64,7 @@ def plant(par: Any) -> Plant:
         preload=lambda x: par.R * (held + x[2]),
         actuator=Actuator((Signal("u", "V"),), (1.0,), current_limit=par.U_max, dead_time=par.T_d),
         contacts=Contacts(("stop",), lambda x: ca.fabs(x[0]) / par.q_max),
-        sensors=Sensors(noise=(par.s_y, par.s_i)[: len(outputs)]),
+        sensors=Sensors(
+            noise=(par.s_y, par.s_i)[: len(outputs)], range=(0, par.U_max / par.R + held)[: len(outputs)]
+        ),
     )

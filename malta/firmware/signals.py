@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from malta.margins.tuned_gains import GainBox
 
 SUM_SHARE = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
-UNLIMITED_RANGE = 1e6  # of an output without a known range: beyond, single precision has no room
+UNLIMITED_RANGE = 1e6  # of a position that nothing bounds: beyond, single precision has no room
+POSITION_UNITS = ("m", "rad", "1")  # of outputs that may be unbounded
 
 
 class CField(NamedTuple):
@@ -270,16 +271,30 @@ def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
 
 @lru_cache(maxsize=16)
 def reading_ranges(plant: Plant) -> FloatArray:
-    """The largest reading of each output that a machine can give, either way: twice where it touches, or its travel.
+    """The largest reading of each output, either way; beyond, an exported controller refuses it.
 
-    Of an output that meets nothing: 1 m, or 1 of its unit; UNLIMITED_RANGE for a machine without contacts, as a
-    motor that turns. Beyond, a reading is refused.
+    What the sensor declares; else twice where the machine touches, or its travel. UNLIMITED_RANGE for positions of a
+    machine without contacts, as a motor that turns.
+
+    Raises InputError for another output without a declared range: readings that are true would be refused.
     """
-    share_used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 0.01, 0.05)
-    ranges, nowhere = [], 1.0 if plant.contacts.names else UNLIMITED_RANGE
-    for k, _ in enumerate(plant.outputs):
-        reach = next((size for size in sizes if share_used(k, size).max(initial=0.0) >= 1), math.inf)
+    share_used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 9.01, 0.05)
+    ranges = []
+    for k, (s, declared) in enumerate(zip(plant.outputs, plant.sensors.range, strict=True)):
+        if declared:
+            ranges.append(float(declared))
+            continue
+        reach = max(_reach(share_used, k, side * sizes) for side in (1.0, -1.0))
         if plant.has_stroke and k == plant.stroke_output and plant.stroke.travel:
             reach = max(plant.stroke.travel, reach if math.isfinite(reach) else 0.0)
-        ranges.append(2 * reach if math.isfinite(reach) else nowhere)
+        if not math.isfinite(reach) and (plant.contacts.names or s.unit not in POSITION_UNITS):
+            found = f"none for {s.name}, which meets no contact"
+            expected = f"its largest reading either way, {s.unit}, as Sensors(range=(...)), 0 for the others"
+            raise InputError(plant.name, "sensors.range", found, expected)
+        ranges.append(2 * reach if math.isfinite(reach) else UNLIMITED_RANGE)
     return readonly(ranges)
+
+
+def _reach(share_used: Callable[[int, float], FloatArray], k: int, readings: FloatArray) -> float:
+    """How large the first of these readings of an output is that uses a clearance up; infinite for none."""
+    return next((abs(float(y)) for y in readings if share_used(k, y).max(initial=0.0) >= 1), math.inf)

@@ -76,6 +76,7 @@ def _linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) 
             noise=given.noise,
             dead_time=given.dead_time,
             computation_time=given.computation_time,
+            range=0.0 if given.range is None else given.range,
         )
 
 

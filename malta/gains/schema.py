@@ -85,6 +85,9 @@ class LinearTable(Record):
     noise: Vector = entry("noise of one sample of each output, rms, SI", shape="p")
     dead_time: Finite = entry("from a reading to its force, half a sample of hold included", "s")
     computation_time: Finite = entry("from a reading to its new force", "s", default=0.0)
+    range: Vector | None = entry(
+        "largest reading of each output either way, SI; 0: not declared", shape="p", default=None
+    )
 
 
 class PlantTable(Record):

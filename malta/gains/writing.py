@@ -342,6 +342,7 @@ def linear_table(parameters: Any) -> dict[str, Any]:
         "noise": np.array(s.noise),
         "dead_time": s.dead_time,
         **({"computation_time": s.computation_time} if s.computation_time else {}),
+        **({"range": np.array(s.range)} if any(s.range) else {}),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from numbers import Real
 from operator import attrgetter
 from typing import Any
 
@@ -28,11 +29,12 @@ def check_signals(plant: Plant) -> None:
     for key in ("states", "inputs", "outputs"):
         if not names[key]:
             raise InputError(plant.name, key, "none", "at least one")
-    by_sensor = ("sensors.lag", "sensors.noise", "sensors.resolution")
+    by_sensor = ("sensors.lag", "sensors.noise", "sensors.resolution", "sensors.range")
     for key, of in {**dict.fromkeys(by_sensor, "outputs"), "inertia": "inputs"}.items():
         found = f"{len(attrgetter(key)(plant))} entries"
         if len(attrgetter(key)(plant)) != len(names[of]):
             raise InputError(plant.name, key, found, f"{len(names[of])}, one for each of the {of}")
+    _check_ranges(plant)
     late = (*plant.sensors.lag, plant.sensors.dead_time)
     times = [time for time in late if isinstance(time, int | float)]
     if not all(0 <= time < math.inf for time in times):
@@ -56,6 +58,14 @@ def check_signals(plant: Plant) -> None:
     for name in plant.uncontrolled:
         if name not in names["states"]:
             raise InputError(plant.name, "uncontrolled", repr(name), "one of " + " ".join(names["states"]))
+
+
+def _check_ranges(plant: Plant) -> None:
+    """Raise InputError for a range of a sensor that is no size, as a pair or a number below 0."""
+    for s, most in zip(plant.outputs, plant.sensors.range, strict=True):
+        if isinstance(most, Sequence | np.ndarray) or (isinstance(most, Real) and not 0 <= most < math.inf):
+            expected = f"its largest reading either way, {s.unit}, or 0: not declared"
+            raise InputError(plant.name, f"sensors.range: {s.name}", repr(most), expected)
 
 
 def _check_intervals(plant: Plant) -> None:

@@ -60,7 +60,7 @@ class Plant:
     load : x -> w of gravity and cogging; default: zero
     position_of : y -> controlled positions at rest (of other states than (q, q'): all states), inverse of h; default: y
     preload : x -> inputs that act at the operating point of the design model; default: those of commands of zero
-    sensors : `Sensors`: noise, resolution, errors, lags and dead time
+    sensors : `Sensors`: noise, resolution, range, errors, lags and dead time
     contacts : `Contacts`: surfaces that the mover may touch
     stroke : `Stroke`: the output that travels, and what drives it; default: the machine has none
     inertia : of each input: factor of p*'' of the same output in the feedforward
@@ -330,6 +330,7 @@ def _defaults(plant: Plant) -> dict[str, Any]:
         "sensors.lag": (0.0,) * p,
         "sensors.noise": (0.0,) * p,
         "sensors.resolution": (0.0,) * p,
+        "sensors.range": (0.0,) * p,
     }
 
 

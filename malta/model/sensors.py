@@ -38,6 +38,8 @@ class Sensors:
     noise : of each sensor, rms of a sample, in the unit of the output; default: zero
     uniform : whether the noise is uniform; else normal
     resolution : of each sensor, in the unit of the output; 0: not quantized; default: zero
+    range : of each sensor, its largest reading either way, in the unit of the output; 0: not declared; default: zero.
+        Exported controllers refuse readings beyond it.
     sense : (x, sensor errors) -> y without noise; default: h of the plant
     errors : systematic errors of the sensors, arguments of `sense`
 
@@ -59,6 +61,7 @@ class Sensors:
     noise: tuple[float, ...] = ()
     uniform: bool = False
     resolution: tuple[float, ...] = ()
+    range: tuple[float, ...] = ()
     sense: CasadiFn = DEFAULT
     errors: tuple[Signal, ...] = ()
 

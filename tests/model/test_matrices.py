@@ -287,7 +287,7 @@ ONE: dict[str, Any] = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
         (
             {"nose": 1},
             "nose: found an unknown detail, expected one of "
-            "name states inputs outputs nominal terms formulas limits limit noise dead_time computation_time "
+            "name states inputs outputs nominal terms formulas limits limit noise dead_time computation_time range "
             "(did you mean 'noise'?)",
         ),
     ],

@@ -83,6 +83,7 @@ def plant(par: Parameters) -> Plant:
             sense=lambda x, errors: x[:6] + errors,
             errors=SENSOR_ERRORS,
             noise=(par.s_p, par.s_p, par.s_p, par.s_a, par.s_a, par.s_a),
+            range=(0.0, 0.0, 0.0, 0.0, 0.0, 1.0),  # rad, of psi, which meets no contact
         ),
         inertia=(par.m, par.m, par.m, par.I_x, par.I_y, par.I_z),
         stroke=Stroke("y", thrust="F_y", travel=par.xy_max, mass=par.m),

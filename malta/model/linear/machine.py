@@ -125,6 +125,7 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
     limits : of parameters, (above, below), exclusive
     limit : of the inputs, one number for all or one for each; default: infinite
     noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
+    range : of the sensors, the largest reading either way, one number for all or one for each; default: 0, not declared
     dead_time, computation_time : s, as an `Actuator` has them: one of the two; default: 0
 
     Returns a Plant.
@@ -186,7 +187,7 @@ def plant(par: Any) -> Plant:
             computation_time=s.computation_time,
             limited=lambda i: i,
         ),
-        sensors=Sensors(noise=s.noise),
+        sensors=Sensors(noise=s.noise, range=s.range),
     )
     return made
 

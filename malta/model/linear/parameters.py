@@ -42,6 +42,7 @@ class LinearSystem:
     formulas: tuple[tuple[str, str], ...] = ()  # added to an entry: ("A_2_1", "-b / J")
     limits: tuple[tuple[str, float, float], ...] = ()  # of parameters: name, above, below; inf: none
     computation_time: float = 0.0  # s, from a sample to its new force
+    range: tuple[float, ...] = ()  # p, largest reading either way, the unit of each output; 0: not declared
 
 
 class Details(TypedDict, total=False):
@@ -59,6 +60,7 @@ class Details(TypedDict, total=False):
     noise: float | Sequence[float]
     dead_time: float
     computation_time: float
+    range: float | Sequence[float]
 
 
 def linear_parameters(A: Any, B: Any, C: Any, **details: Unpack[Details]) -> Parameters:
@@ -88,6 +90,7 @@ def linear_parameters(A: Any, B: Any, C: Any, **details: Unpack[Details]) -> Par
         _formulas(formulas, nominal, matrices),
         _limits(details.get("limits", {}), nominal),
         _numbers("computation_time", details.get("computation_time", 0.0), 1)[0],
+        _numbers("range", details.get("range", 0.0), p),
     )
     if not math.isfinite(sum(system.noise) + system.dead_time + system.computation_time):
         raise InputError(CALLER, "noise, dead_time, computation_time", "infinity", "finite numbers")
