@@ -224,6 +224,7 @@ MONITORS = (
     *("STOP", "STO"),
 )
 
+ROUNDING = 1e-9  # share of what a sum of products consists of, below which it is zero
 MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
 TOUCH = 0.7  # share of a clearance: two outputs at it are not beyond the clearance of a round bearing
 JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a returning reading may have
@@ -235,6 +236,7 @@ DISTURBANCE_SHARE = 0.05  # of the largest acceleration: a machine may leave the
 # Share of the largest acceleration with which references stop. Twice as much takes the voltage that the bearings need
 # when the link sags by 90 %, and ends in a touchdown.
 STOPPING_SHARE = 0.1
+HELPLESS_SAMPLES = 10  # with a force at its limit and a sensor ignored, until it is a fault
 BRIDGED_SAMPLES = 10  # samples for which a sensor is ignored before the reference stops
 SETTLED_DEVIATIONS = 12.0  # standard deviations of readings that errors may have
 SAG_SHARE = 0.3  # share of the link's voltage that is missing
@@ -363,7 +365,9 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor(
             "ASTRAY", "expected reading where none can be, or no reference is", 1.0, 5, "FAULT", IN_FLIGHT
         ),
-        Monitor("HELPLESS", "a force at its limit, a sensor ignored", 0.5, 10, "FAULT", IN_FLIGHT),
+        Monitor(
+            "HELPLESS", "a force at its limit, a sensor ignored", 0.5, HELPLESS_SAMPLES, "FAULT", IN_FLIGHT
+        ),
         Monitor("MISSED", "missed steps before this one", 2.5, 1, "HOLD", moving),
         Monitor("MISSED", "missed steps before this one", b.unbelieved + 0.5, 1, "LAND", IN_FLIGHT),
         Monitor("OVERRUN", "share of samples after a missed step", LATENESS[0], 1, "HOLD", moving),
@@ -405,6 +409,7 @@ def absent_monitors(t: Target) -> dict[str, str]:
     """The monitors that make no sense for a target's machine, each with the reason."""
     b = bounds_of(t)
     unlimited = not np.isfinite(t.controller.limits.force).any()
+    faulty_at_once = len(t.controller.measurements) == 1 or not gains_without(t).L
     listed = (
         (not np.isfinite(b.touch).any(), "nothing is met", ("TOUCH",)),
         (not np.isfinite(b.jump).any(), "no speed is too large", ("RATE",)),
@@ -422,6 +427,11 @@ def absent_monitors(t: Target) -> dict[str, str]:
             ("CURRENT_INFERRED", "CURRENT_SUM", "CURRENT_FROZEN"),
         ),
         (unlimited, "forces have no limits", ("HELPLESS", "SATURATION")),
+        (
+            faulty_at_once and b.unbelieved < HELPLESS_SAMPLES and not unlimited,
+            "a sensor that is ignored so long is a fault already",
+            ("HELPLESS",),
+        ),
     )
     return {key: reason for absent, reason, keys in listed if absent for key in keys}
 
@@ -487,6 +497,27 @@ def accelerations(c: Controller) -> FloatArray:
     return np.array([np.sum(row[row > 0] * limits[row > 0]) or math.inf for row in gain])
 
 
+def reachable_rates(c: Controller, way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Speeds and accelerations that the forces reach over a way d of each output; inf without limits.
+
+    The first derivative that the forces set at once is y^(r), at most J = |C A^(r-1) B| v within their limits. By it
+    the output goes d within about T = (d / J)^(1/r), with accelerations of d / T^2, J itself for r = 2, and speeds of
+    at most J for r = 1.
+    """
+    limits = np.asarray(c.limits.force, dtype=float)
+    speeds, accelerations = np.full(len(way), math.inf), np.full(len(way), math.inf)
+    power, size = np.eye(len(c.A)), np.eye(len(c.A))
+    for r in range(1, len(c.A) + 1):
+        gain, scale = np.abs(c.C @ power @ c.B), np.abs(c.C) @ size @ np.abs(c.B)
+        for k in np.flatnonzero(np.isinf(accelerations) & (gain > ROUNDING * scale).any(axis=1)):
+            acts = gain[k] > ROUNDING * scale[k]
+            J = float(np.sum(gain[k, acts] * limits[acts]))
+            accelerations[k] = way[k] * (J / way[k]) ** (2 / r)
+            speeds[k] = J if r == 1 else math.inf
+        power, size = power @ c.A, size @ np.abs(c.A)
+    return speeds, accelerations
+
+
 def stars_of(t: Target) -> tuple[tuple[int, ...], ...]:
     """The current readings that add up to zero, by index: those of one star point each; none of axes."""
     return tuple(t.believed.drive.stars) if t.driven and t.fidelity == "phase" else ()
@@ -520,14 +551,16 @@ def reference_limits(t: Target) -> ReferenceLimits:
     """The limits of references: of the design file, or by default those of the machine.
 
     Positions: RESERVED_SHARE less than the way to a touchdown or the travel; else the range of its readings.
-    Accelerations: all that the forces can do. Speeds: from rest through twice the way with that, v = sqrt(4 a d).
+    Accelerations: all that the forces can do. Speeds: from rest through twice the way with that, v = sqrt(4 a d). Of a
+    machine whose states are not positions and rates: see reachable_rates.
 
     Raises InputError for a position beyond the way to a touchdown, the travel, or what can be read.
     """
     touch, most = touch_bounds(t.believed), accelerations(t.controller)
     position = np.where(np.isfinite(touch), (1 - RESERVED_SHARE) * touch, reading_ranges(t.believed))
-    acceleration = np.minimum(most, MOST_RATE)
-    speed = np.minimum(np.sqrt(4 * acceleration * position), MOST_RATE)
+    fastest, steepest = reachable_rates(t.controller, position)
+    acceleration = np.minimum(np.where(np.isfinite(most), most, steepest), MOST_RATE)
+    speed = np.minimum(np.minimum(np.sqrt(4 * acceleration * position), fastest), MOST_RATE)
     limits = ReferenceLimits(position, speed, acceleration)
     if not t.controller.references.size:
         return limits

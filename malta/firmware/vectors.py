@@ -177,11 +177,21 @@ class OutOfReach(NamedTuple):
 
 
 def out_of_reach(t: Target) -> list[OutOfReach]:
-    """Where a row counts but cannot act: a landing of a stroke alone ends at the first sample without its sensor."""
-    if not _only_stroke(t):
-        return []
-    reason = "a stroke may end anywhere: it is off at the first sample without its sensor"
-    return [OutOfReach(key, "LANDING", reason) for key in ("STUCK", "UNBELIEVED", "BLIND", "HELPLESS")]
+    """Where a row counts but no fault of the test makes it act.
+
+    A landing of a stroke alone ends at the first sample without its sensor; a law that sums nothing up has no memory
+    that holds a force at its limit.
+    """
+    found = []
+    if _only_stroke(t):
+        reason = "a stroke may end anywhere: it is off at the first sample without its sensor"
+        found = [OutOfReach(key, "LANDING", reason) for key in ("STUCK", "UNBELIEVED", "BLIND", "HELPLESS")]
+    if t.controller.tracks == "states" and not t.controller.Ki.any() and not t.controller.observed:
+        reason = "the law sums nothing up that holds a force at its limit"
+        rows = [row for row in monitors_of(t) if row.key in ("HELPLESS", "SATURATION")]
+        cells = dict.fromkeys((row.key, state) for row in rows for state in row.states)
+        found += [OutOfReach(*cell, reason) for cell in cells if cell not in {one[:2] for one in found}]
+    return found
 
 
 def _only_stroke(t: Target) -> bool:
@@ -211,7 +221,9 @@ def trial_context(t: Target, name: str) -> dict[str, Any]:
         "longest_trial": MAX_TRIAL_SAMPLES,
         "sensors": ", ".join(f"{_sensors(row, t)}u" for row in monitors_of(t)),
         "out_of_reach": ", ".join(f"{_unreached_states(row, t)}u" for row in monitors_of(t)),
+        "moves_otherwise": not t.believed.second_order,
         "unreached": _unreached_lines(t),
+        "never_act": [k for k, row in enumerate(monitors_of(t)) if not _tried_states(row, t)],
         **_strokes(t),
         **_pieces(t, name),
     }
@@ -235,7 +247,7 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
         "jump": 3 * b.jump,
         "settled": np.maximum(3 * b.settled, 2.5 * JUMP * sigma),
         "drift_step": np.where(np.isfinite(b.jump), 0.6 * b.jump, b.settled),
-        "step": 0.5 * reference_limits(t).position,
+        "step": _refused_steps(t),
         "rest": _place_of_rest(t, 3 * b.settled),
         "per_unit": per_unit,
         "shift": 2.5 * JUMP * sigma * per_unit,
@@ -244,6 +256,8 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
         "sum": [1e6],
         "observed": [2 * float(np.max(np.where(np.isfinite(limits), limits, 100.0)))],
     }
+    if c.tracks == "errors" and not c.Ki.any():  # the sums are among its states
+        numbers["saturating"] = np.linalg.pinv(c.K) @ (2 * np.where(np.isfinite(limits), limits, 100.0))
     if t.driven:
         largest = float(np.max(c.limits.current))
         numbers |= {
@@ -256,6 +270,13 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
         }
     found = {key: _numbers(values, t) for key, values in numbers.items()}
     return found | {"missed": str(b.unbelieved + 1)}
+
+
+def _refused_steps(t: Target) -> FloatArray:
+    """Steps of references within the limits of places, too far for a sample; beyond those where none is too far."""
+    limits = reference_limits(t)
+    steps = 0.5 * limits.position
+    return np.where(steps > 1.1 * limits.speed * t.controller.sample_time, steps, 2 * bounds_of(t).range)
 
 
 def _numbers(values: Iterable[float], t: Target) -> str:
@@ -294,14 +315,24 @@ def _unreached_states(row: Monitor, t: Target) -> int:
     return sum(1 << numbers[one.state] for one in found)
 
 
+def _tried_states(row: Monitor, t: Target) -> set[State]:
+    """The states in which a fault makes a row act."""
+    return set(row.states) - {one.state for one in out_of_reach(t) if one.key == row.key}
+
+
 def _unreached_lines(t: Target) -> list[str]:
     """What the test does not reach, for its reader: monitors that the machine does not have, and cells of the table."""
     reasons: dict[str, list[str]] = {}
     for key, reason in absent_monitors(t).items():
         reasons.setdefault(reason, []).append(key.lower())
     lines = [f"without {' '.join(keys)}: {reason}" for reason, keys in reasons.items()]
-    cells = [(f"{one.key.lower()} in {one.state.lower()}", one.reason) for one in out_of_reach(t)]
-    return lines + [f"without {cell}: {reason}" for cell, reason in cells]
+    cells: dict[tuple[str, str], list[str]] = {}
+    for one in out_of_reach(t):
+        cells.setdefault((one.key, one.reason), []).append(one.state.lower())
+    more = [
+        f"without {key.lower()} in {' '.join(states)}: {reason}" for (key, reason), states in cells.items()
+    ]
+    return lines + more
 
 
 def _motion_near_end(t: Target) -> dict[str, Any]:
