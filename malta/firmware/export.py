@@ -13,6 +13,7 @@ import numpy as np
 from malta.arguments import positive
 from malta.errors import InputError
 from malta.files import file_exists, locate
+from malta.firmware.agreement import require_same_law
 from malta.firmware.calibration import (
     FNV_FACTOR,
     FNV_START,
@@ -508,8 +509,9 @@ def export_c(
 
     Returns the files.
 
-    Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, and duty
-    cycles of a machine without windings.
+    Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, duty
+    cycles of a machine without windings, and a sensor whose range nothing tells; CheckError where the export answers
+    readings within their ranges otherwise than the law of simulations.
 
     >>> import malta
     >>> gains = "design/gains/tubular_pid.json"
@@ -525,6 +527,7 @@ def export_c(
         target = replace(target, logged=positive("export", "log", log))
         ring_of(target, "")  # raises before anything is proven
     folder, content = require_empty(Path(out)), content_of(path)[0]
+    require_same_law(target)
     robust = content.verification.robust
     uncertainty = {} if robust is None else robust.uncertainty
     if tunable and proof:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from malta.files import locate
+from malta.firmware.agreement import require_same_law
 from malta.firmware.export import Until, target_of
 from malta.firmware.fmu import Part, build_fmu
 from malta.gains.file import content_of
@@ -38,7 +39,8 @@ def export_fmu(
     Returns "", or a sentence that says why the FMU has sources but no binary.
 
     Raises InputError for another part, version or platform, without ziglang where it is asked for, and for
-    duty cycles of a machine without windings; CheckError where ziglang fails.
+    duty cycles of a machine without windings; CheckError where ziglang fails, and where the controller answers readings
+    within their ranges otherwise than the law of simulations.
 
     >>> import malta
     >>> from zipfile import ZipFile
@@ -49,6 +51,8 @@ def export_fmu(
     """
     path = locate(gains)
     target = replace(target_of(read_stable(path), "double", until), tunable=tunable and part != "machine")
+    if part != "machine":
+        require_same_law(target)
     fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi, platforms=platforms)
     replace_files({Path(out): fmu.content})
     return fmu.note
