@@ -2,7 +2,8 @@
 
 The figures come from the machine's own loop (hold, delay, current loops):
 
-    margin             box of the parameters at which a corner of it becomes unstable, at the middle and the ends
+    margin             box of the parameters at which a corner of it becomes unstable, at the middle and the ends of the
+                       stroke, at the value and the ends of each interval of `plant.over`
     peak sensitivity   largest |S_ii|; bandwidth: the smallest of those of verify's definitions that bind every group
     motion, noise      discrete Lyapunov equation with the sensors' noise and the steps' q^2 / 12
 
@@ -216,7 +217,10 @@ def groups_of(spec: Spec) -> list[TuningGroup]:
     driven = _driven_windings(spec)
     windings = None if driven is None else driven.windings
     systems = (
-        [of_plant(plant, names, at=place, windings=windings, loaded=False) for place in positions]
+        [
+            of_plant(plant, (*names, *_intervals(spec)), at=place, windings=windings, loaded=False)
+            for place in positions
+        ]
         if proven
         else []
     )
@@ -394,6 +398,16 @@ def _sample(spec: Spec, driven: Driven | None, part: MachinePart, forecast: Floa
     return SampledMachine(Ad, Bd, np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))]))
 
 
+def _intervals(spec: Spec) -> dict[str, tuple[float, ...]]:
+    """The value and both ends of each interval that proofs cover, of parameters that are not uncertain."""
+    plant = spec.plant
+    return {
+        name: tuple(sorted({*ends, float(getattr(plant.parameters, name))}))
+        for name, ends in plant.over.items()
+        if name not in spec.uncertainty
+    }
+
+
 def _corners(
     spec: Spec, driven: Driven | None, systems: list[Any], group: tuple[Any, Any, Any], forecast: FloatArray
 ) -> SampledMachine:
@@ -403,8 +417,9 @@ def _corners(
     levels = np.arange(0.0, min(1 / share) - STEP / 3, STEP)
     made: dict[bytes, list[SampledMachine]] = {}  # machines that are mirror images have the same poles: once
     for system in systems:
-        for corner in signs:
-            rows = np.array([system.nominal * (1 + t * share * corner) for t in levels])
+        for corner, values in itertools.product(signs, itertools.product(*_intervals(spec).values())):
+            grown = system.nominal[: len(share)] * (1 + np.outer(levels, share * corner))
+            rows = np.hstack([grown, np.tile(values, (len(levels), 1))])
             wholes = [MachinePart(*matrices) for matrices in zip(*system.at(rows), strict=True)]
             parts = [_cut(spec, driven, whole, group) for whole in wholes]
             key = b"".join(np.abs(M).round(9).tobytes() for part in parts for M in part)
@@ -444,7 +459,8 @@ def figures_of_gains(spec: Spec, group: TuningGroup, g: Gains) -> dict[str, floa
     if spec.pid is None:
         known = (len(g.Ad) - len(group.states)) // len(group.inputs) - bool(spec.weights.drift_variance.size)
     resting = known if spec.current_lag else 0
-    peak, bandwidth = _response(group, g, steady, Ts, known=resting, alone=alone)
+    w_n = _natural_frequency(group, g, resting) if spec.plant.second_order else math.inf
+    peak, bandwidth = _response(group, steady, Ts, w_n=w_n, alone=alone)
     try:
         answers = tuple((place.position, _answer(group, place, g, law, Ts)) for place in group.places)
     except CheckError:
@@ -514,22 +530,26 @@ def _answer(group: TuningGroup, place: StrokePlace, g: Gains, law: LinearLaw, Ts
 
 
 def _response(
-    group: TuningGroup, g: Gains, law: LinearLaw, Ts: float, *, known: int, alone: bool
+    group: TuningGroup, law: LinearLaw, Ts: float, *, w_n: float, alone: bool
 ) -> tuple[float, float]:
-    """Peak sensitivity and bandwidth, rad/s; known: blocks of forces under way that count at rest.
+    """Peak sensitivity and bandwidth, rad/s; w_n: the smallest natural frequency, infinite where there is none.
 
     Of several groups, the loop gain's last crossing is that of the widest: it binds a group that stands alone.
     """
     machine = SampledLoop(group.nominal.Ad, group.nominal.Bd, group.nominal.Cd, law, Ts)
     cut = Nominal(*machine.systems, True, Ts)
-    n = len(group.states)
-    half = n // 2
-    stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
-    w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
-    bandwidth = min(tracked_band(cut)[0], w_n)
+    bandwidth = min(tracked_band(cut, min(len(group.outputs), len(group.inputs)))[0], w_n)
     if alone:
         bandwidth = min(bandwidth, last_crossover(cut))
     return largest_gain(cut.sensitivity(i) for i in cut.sensors).value, bandwidth
+
+
+def _natural_frequency(group: TuningGroup, g: Gains, known: int) -> float:
+    """The smallest natural frequency of q'' = (k - G K1) q, rad/s; known: blocks of forces under way, at rest."""
+    n = len(group.states)
+    half = n // 2
+    stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
+    return math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
 
 
 def _noise(group: TuningGroup, law: LinearLaw, closed: FloatArray) -> NoiseRms:

@@ -348,5 +348,7 @@ def problem_sha256(spec: Spec) -> str:
     loads = asdict(spec.loads) if spec.loads else None
     pushes = [asdict(bound) for bound in spec.recovery.values()]
     settings = (FRONT, DIGITS, groups.STEP, groups.CORNER_FACTOR)
-    content = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
+    content: list[Any] = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
+    if spec.plant.over:
+        content.append(sorted(spec.plant.over.items()))
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
