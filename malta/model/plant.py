@@ -107,6 +107,12 @@ class Plant:
             """Say in which group a field is, for the names that a plant had before it had groups."""
             return refuse_reading(name)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the parameters, and what was changed beside them."""
+        from malta.model.pickling import recipe_of  # which builds plants
+
+        return recipe_of(self)
+
     def __post_init__(self) -> None:
         refuse_flat({name: getattr(self, name) for name in GROUPS}, self.name)
         for name, value in _defaults(self).items():
