@@ -78,11 +78,26 @@ def by_name(caller: str, name: str, value: Any, example: str) -> Mapping[str, An
     return value
 
 
+def require_real(caller: str, name: str, value: Any) -> Any:
+    """The same value. Raises InputError for complex numbers in it, whose imaginary parts numpy would leave out."""
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError, NotImplementedError):
+        return value  # what it is instead, its reader says
+    some = [x for x in found.ravel().tolist() if isinstance(x, complex)] if found.dtype.kind in "cO" else []
+    if some:
+        worst = max(some, key=lambda x: abs(x.imag))
+        raise InputError(caller, name, f"complex numbers, as {worst:g}", "real numbers")
+    return value
+
+
 def matrix(caller: str, name: str, value: Any, wanted: str = "a matrix of numbers") -> FloatArray:
     """A matrix of finite numbers; a number is 1 x 1, a row of them 1 x n. Raises InputError."""
     try:
-        found = np.asarray(value)
+        found = np.asarray(require_real(caller, name, value))
         read = np.atleast_2d(found.astype(float)) if found.dtype.kind in "biufO" else None
+    except InputError:
+        raise
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         read = None
     if read is None or read.ndim != 2:

@@ -193,7 +193,7 @@ class Loop:
 
 
 def loop(
-    plant: Plant,
+    plant: Plant | LinearModel,
     controller: Controller,
     /,
     *,
@@ -203,12 +203,12 @@ def loop(
 ) -> Loop:
     """Make the loop of a machine and a controller at an operating point.
 
-    plant : the machine
+    plant : the machine; or a LinearModel of it, which brings its operating point
     controller : its controller
     parameters : of the machine that differ, by name, SI; the controller keeps what it believes
     current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag",
         first-order lags at their crossover
-    at : states that are not zero, SI; none: the controller's operating point
+    at : states that are not zero, SI; none: the model's operating point, or the controller's
 
     Returns a Loop.
 
@@ -221,13 +221,19 @@ def loop(
     >>> f"slowest pole {heavy.poles.real.max():.2f} rad/s"
     'slowest pole -9.89 rad/s'
     """
+    design = controller.operating_point[0]
+    if isinstance(plant, LinearModel):
+        model = plant
+        plant, design = model.plant, model.operating_point.x[list(model.plant.controlled)]
+    if not isinstance(plant, Plant):
+        raise InputError("loop", "plant", f"a {type(plant).__name__}", "a Plant or a LinearModel")
     chosen_loops(plant, controller, current_loops)
     require_known(parameters or (), units_of(plant.parameters), "loop", found="an unknown parameter")
     machine = with_parameters(plant, replace(plant.parameters, **parameters)) if parameters else plant
     names = [s.name for s in controller.measurements]
     if names != [s.name for s in plant.outputs]:
         raise InputError("loop", "controller", f"one of {' '.join(names)}", f"one of the {plant.name}")
-    x = plant.state(at) if at else plant.point(controller.operating_point[0]).x
+    x = plant.state(at) if at else plant.point(design).x
     return _cached_loop(machine, controller, tuple(position_at(plant, x).items()), current_loops)
 
 

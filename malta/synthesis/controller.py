@@ -308,6 +308,13 @@ class Controller:
 
         return law_system(self)
 
+    @cached_property
+    def compensator(self) -> Any:
+        """The law without saturation as a malta.proof.Compensator, behind its machine's delay and current loops."""
+        from malta.synthesis.law_system import law_compensator
+
+        return law_compensator(self)
+
 
 def lag_shares(c: Controller) -> list[tuple[int, float]]:
     """How much of commands a lagging force takes on in a sample, with their age in samples: of one, or of two."""

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
+from malta.arguments import require_real
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.diagrams import feedback, parallel
@@ -337,7 +338,8 @@ def transfer(name: str, numerator: Sequence[float], denominator: Sequence[float]
     >>> structured.transfer("shape", [2.0, 100.0], [1.0, 50.0]).values
     {'shape.b1': 2.0, 'shape.b0': 100.0, 'shape.a0': 50.0}
     """
-    a, b = np.asarray(denominator, dtype=float), np.asarray(numerator, dtype=float)
+    given = (require_real(CALLER, name, one) for one in (denominator, numerator))
+    a, b = (np.asarray(one, dtype=float) for one in given)
     n = len(a) - 1
     if n < 0 or not a[0] or len(b) > n + 1:
         found = f"{len(b)} over {len(a)} coefficients"
@@ -375,7 +377,7 @@ def states(name: str, start: Any, pattern: Any = None) -> Element:
     (1, 4)
     """
     given = (start.A, start.B, start.C, start.D) if hasattr(start, "A") else start
-    parts = [np.atleast_2d(np.asarray(M, dtype=float)) for M in given]
+    parts = [np.atleast_2d(np.asarray(require_real(CALLER, name, M), dtype=float)) for M in given]
     shapes = [M.shape for M in parts]
     (n, _), (m, r) = shapes[0], shapes[3]
     if shapes != [(n, n), (n, r), (m, n), (m, r)] or not all(np.isfinite(M).all() for M in parts):
@@ -427,7 +429,8 @@ def observer(name: str, model: Any, K: Any, L: Any) -> Element:
     (2, 4, [[300.0, 20.0]])
     """
     given = (model.A, model.B, model.C) if hasattr(model, "A") else model
-    A, B, C, K, L = (np.atleast_2d(np.asarray(M, dtype=float)) for M in (*given, K, L))
+    read = (require_real(CALLER, name, M) for M in (*given, K, L))
+    A, B, C, K, L = (np.atleast_2d(np.asarray(M, dtype=float)) for M in read)
     (n, m), p = B.shape, len(C)
     shapes = [M.shape for M in (A, C, K, L)]
     if shapes != [(n, n), (p, n), (m, n), (n, p)] or not all(np.isfinite(M).all() for M in (A, B, C, K, L)):

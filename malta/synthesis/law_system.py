@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
+from malta.errors import InputError
 from malta.linear.matrices import balanced_units
+from malta.linear.uncertain import Compensator
 from malta.model.machines import build_plant
 from malta.model.places import outputs_at
 from malta.synthesis.controller import Controller
@@ -35,6 +38,22 @@ def law_system(c: Controller) -> Any:
     names = {"states": states} if len(t) else {}
     matrices = (law.A * t / t[:, None], B / t[:, None], law.C * t, D)
     return control.ss(*matrices, c.sample_time, name=c.name, inputs=inputs, outputs=forces, **names)
+
+
+def law_compensator(c: Controller) -> Compensator:
+    """The control law as the compensator of a proof: hold, the actuator's delay, and its lag.
+
+    Raises InputError for a law that is scheduled.
+    """
+    if c.schedule is not None:
+        raise InputError(
+            c.name, "compensator", "a scheduled law", "a law of one set of gains, or a malta.loop"
+        )
+    law, actuator = linear_law(c), build_plant(c.parameters).actuator
+    lag = float(actuator.crossover) if math.isfinite(actuator.crossover) else None
+    sums = 0 if c.observed else len(c.summed)
+    Ts = c.sample_time
+    return Compensator(law.A, law.B_y, law.C, law.D_y, sums, Ts, actuator.delay(Ts), lag)
 
 
 def reference_names(c: Controller) -> list[str]:

@@ -25,7 +25,7 @@ import math
 from contextlib import suppress
 from dataclasses import replace
 from numbers import Real
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from scipy import linalg
@@ -34,6 +34,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.matrices import add_integrals, eigenvalues, system_matrix
 from malta.linear.sampling import sample, sample_cost, split_delay, stored_blocks, whole_or_not
+from malta.model.linear.machine import linear_model_of
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
@@ -102,7 +103,7 @@ def gains(
 @on_one_thread
 @np.errstate(all="ignore")  # what overflows is found at the end
 def lqg(
-    model: LinearModel,
+    model: LinearModel | Any,
     weights: Weights,
     Ts: float,
     discretization: Discretization = "sampled-data",
@@ -116,7 +117,7 @@ def lqg(
 ) -> Controller:
     """Design an LQG controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop, all sampled.
 
-    model : the machine's linear model
+    model : the machine's linear model; or its Plant, at rest at zero, or a continuous control.StateSpace
     weights : of the cost, and the noise of one sample
     Ts : sample time, s
     discretization : "sampled-data" (cost and noise integrated over the sample, Van Loan), "zoh" (taken once a sample)
@@ -145,6 +146,7 @@ def lqg(
     """
     if not (math.isfinite(Ts) and Ts > 0):
         raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
+    model = linear_model_of(model, "lqg")
     if model.operating_point.loaded:
         raise InputError(
             "lqg", "model", "a model at its trim", "one at plant.at(...): v0(z) cancels the loads"

@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
+from malta.arguments import require_real
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors
 from malta.linear.conversion import from_control
@@ -118,7 +119,7 @@ def _model_of(name: str, model: Any) -> System:
             kind = f"a model with dt = {model.dt}, or with D"
             raise InputError(CALLER, name, kind, "a continuous one without D")
         return found
-    A, B, C = (np.atleast_2d(np.asarray(M, dtype=float)) for M in model)
+    A, B, C = (np.atleast_2d(np.asarray(require_real(CALLER, name, M), dtype=float)) for M in model)
     n, shapes = len(A), [M.shape for M in (A, B, C)]
     if shapes != [(n, n), (n, B.shape[1]), (len(C), n)] or not all(np.isfinite(M).all() for M in (A, B, C)):
         raise InputError(CALLER, name, f"A, B and C of shapes {shapes}", "matrices that fit, of numbers")

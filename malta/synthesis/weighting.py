@@ -8,6 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from malta.arguments import require_real
 from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
@@ -168,7 +169,7 @@ def weights(
 
 
 def _diagonal(name: str, value: ArrayLike) -> FloatArray:
-    found: FloatArray = np.atleast_1d(np.asarray(value, dtype=float))
+    found: FloatArray = np.atleast_1d(np.asarray(require_real("weights", name, value), dtype=float))
     if found.ndim == 1:
         return found
     if found.ndim != 2 or found.shape[0] != found.shape[1] or np.any(found - np.diag(np.diag(found))):

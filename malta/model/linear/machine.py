@@ -25,6 +25,7 @@ from malta.linear.matrices import system_matrix
 from malta.model.actuator import Actuator
 from malta.model.linear.formulas import FUNCTIONS, MAX_FORMULA_LENGTH, value_of
 from malta.model.linear.parameters import CALLER, LETTERS, Details, LinearSystem, linear_parameters
+from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import symbolic_names
 from malta.model.plant import Plant, Signal
 from malta.model.plants import plant_of
@@ -150,6 +151,20 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
             raise InputError(CALLER, both[0], "beside an uncertain system, which has its own", "none")
         details = {**own, **details}
     return plant_of(linear_parameters(A, B, C, **details))
+
+
+def linear_model_of(source: Any, caller: str) -> LinearModel:
+    """The linear model that a function was given: as it is, of a Plant at rest at zero, or of a control.StateSpace.
+
+    Raises InputError for another source, which names the caller.
+    """
+    if isinstance(source, LinearModel):
+        return source
+    made = linear_machine(source) if hasattr(source, "state_labels") else source
+    if not isinstance(made, Plant):
+        expected = "a LinearModel, a Plant or a continuous control.StateSpace"
+        raise InputError(caller, "model", f"a {type(source).__name__}", expected)
+    return linearize(made, made.at())
 
 
 def plant(par: Any) -> Plant:

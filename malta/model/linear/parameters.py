@@ -13,6 +13,7 @@ from typing import Any, TypedDict, Unpack, cast
 
 import numpy as np
 
+from malta.arguments import require_real
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.linear.formulas import value_of
@@ -138,7 +139,9 @@ def is_linear(parameters: Any) -> bool:
 
 def _matrix(name: str, value: Any) -> FloatArray:
     try:
-        found = np.array(value, dtype=float)
+        found = np.array(require_real(CALLER, name, value), dtype=float)
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(CALLER, name, f"a {type(value).__name__}", "a matrix of numbers") from error
     if found.ndim != 2 or not np.isfinite(found).all():
@@ -243,7 +246,9 @@ def _numbers(what: str, given: Any, count: int, *, zero: bool = True) -> tuple[f
     """`count` numbers of at least 0, or above 0 unless `zero`; one number stands for all. Raises InputError."""
     wanted = f"a number {'of at least' if zero else 'above'} 0, or {count} of them"
     try:
-        found = np.broadcast_to(np.asarray(given, dtype=float), (count,))
+        found = np.broadcast_to(np.asarray(require_real(CALLER, what, given), dtype=float), (count,))
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(CALLER, what, repr(given), wanted) from error
     if not (found >= 0 if zero else found > 0).all():  # or NaN
