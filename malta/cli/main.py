@@ -132,6 +132,9 @@ def renew(args: list[str]) -> list[str]:
 UsageError: Any = typer.BadParameter.__base__  # of click, or of the copy of it in newer versions of typer
 
 
+HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+
+
 class Commands(Mapping[str, Any]):
     """The commands by name. Each is made of its function when it is asked for: the others are not, which takes long."""
 
@@ -143,7 +146,7 @@ class Commands(Mapping[str, Any]):
         """The command of a name. Raises KeyError for an unknown one."""
         if name not in self._made:
             alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-            alone.command(cls=PanelCommand)(self._functions[name])
+            alone.command(cls=PanelCommand, context_settings=HELP_NAMES)(self._functions[name])
             self._made[name] = get_command(alone)
         return self._made[name]
 
@@ -208,6 +211,7 @@ GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
 app = typer.Typer(
     cls=Grouped,
     no_args_is_help=True,
+    context_settings=HELP_NAMES,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help="""Controllers for self-bearing and magnetically levitated actuators: from a machine's data to verified
@@ -249,6 +253,10 @@ def main() -> None:
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()  # now: at the end of the process nobody could say what went wrong
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):  # typer's answer to a reader that has read enough
+            sys.exit(0)
+        raise
     except UsageError as error:
         sys.exit(_print_usage(error))
     except (typer.Abort, KeyboardInterrupt):  # before or after the command itself
@@ -272,8 +280,27 @@ def _print_usage(error: Any) -> int:
         error.show()
     else:
         command = error.ctx.command_path if error.ctx is not None else "malta"
-        print_note(shorten(f"{error.format_message().rstrip('.')}; see {command} --help"))
+        print_note(shorten(f"{_usage_text(error)}; see {command} --help"))
     return 2
+
+
+NUMBER_TEXTS = {
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_parsing": "a number",
+}
+
+
+def _usage_text(error: Any) -> str:
+    """What is wrong with an argument, in malta's words: what was found, and what was expected."""
+    refused = getattr(error.__context__, "errors", None)  # of the library that reads values
+    if refused is None or error.param is None:
+        return str(error.format_message().rstrip("."))
+    first = refused()[0]
+    limit = first["msg"].removeprefix("Input should be ")
+    expected = NUMBER_TEXTS.get(first["type"], f"a number {limit}" if "than" in limit else limit)
+    name = error.param.opts[0] if error.param.opts[0].startswith("-") else error.param.make_metavar(error.ctx)
+    return str(InputError(name, "", repr(first["input"]), expected))
 
 
 def _end_output(error: OSError) -> int:
@@ -281,7 +308,7 @@ def _end_output(error: OSError) -> int:
     where, found = error.filename or "standard output", error.strerror or type(error).__name__
     silence(sys.stdout)
     if isinstance(error, BrokenPipeError):  # whoever read has read enough
-        return 1
+        return 0
     return print_error(InputError(where, "", found, "a place to write to"))
 
 

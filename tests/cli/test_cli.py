@@ -974,7 +974,7 @@ def test_no_design_files_at_all(run: Run, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ("simulate TABLE2 --seed one", "'--seed'"),
+        ("simulate TABLE2 --seed one", "--seed: found 'one'"),
         ("simulate TABLE2 --speed 3", "--speed"),
         ("simulate TABLE2 --set", "--set"),
         ("verify", "GAINS"),
@@ -1064,6 +1064,37 @@ def test_full_device_is_refused_in_a_sentence(buffered: str) -> None:
 
 
 def test_reader_that_has_read_enough_is_no_error() -> None:
-    command = f"{sys.executable} -m malta --help | head -1"
-    ended = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    line = f"{sys.executable} -m malta --help | head -1"
+    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
     assert (ended.stdout.count("Usage"), ended.stderr) == (1, "")
+    read, write = os.pipe()
+    os.close(read)
+    for arguments in (["--version"], ["verify", "--help"], ["schema", "verify-output"]):
+        command = [sys.executable, "-m", "malta", *arguments]
+        closed = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
+        assert (closed.returncode, closed.stderr) == (0, b"")
+    os.close(write)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("simulate", TABLE2, "--seed", "x"), "--seed: found 'x', expected a whole number"),
+        (("campaign", TABLE2, "--samples", "1.5"), "--samples: found '1.5', expected a whole number"),
+        (("pil", TABLE2, "--port", "p", "--timeout", "y"), "--timeout: found 'y', expected a number"),
+        (
+            ("tune", "design/robust.toml", "--generations", "-1"),
+            "--generations: found '-1', expected a number greater than or equal to 0",
+        ),
+    ],
+)
+def test_numbers_that_are_none_get_a_sentence(arguments: tuple[str, ...], sentence: str, run: Run) -> None:
+    code, _, err = run(*arguments)
+    assert (code, err) == (2, f"malta: {sentence}; see malta {arguments[0]} --help\n")
+
+
+@pytest.mark.parametrize("command", ["", "verify", "campaign"])
+def test_a_short_word_asks_for_help(command: str) -> None:
+    whole, short = (CliRunner().invoke(cli.app, [*command.split(), word]).output for word in ("--help", "-h"))
+    assert whole == short
+    assert whole.startswith("Usage:")
