@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import keyword
 import re
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -269,6 +273,9 @@ def new(
     files = [
         path for path in sorted(source.rglob("*")) if path.suffix in (".py", ".toml") and _is_source(path)
     ]
+    if name in _taken_names(files):
+        found = f"{name!r}, which Python, the module or the notebook has for something else"
+        raise InputError("malta new", "NAME", found, "another name")
     renamed = {
         folder / path.relative_to(source).with_name(path.name.replace(EXAMPLE, name)): path for path in files
     }
@@ -283,6 +290,17 @@ def new(
     console = make_console()
     print_written(console, renamed)
     console.print(NEXT_STEPS.format(name=name), soft_wrap=True)  # commands stay whole, to be copied
+
+
+def _taken_names(files: Sequence[Path]) -> set[str]:
+    """Names under which a copy of these files would not work: words of Python, modules, and what the files name."""
+    texts = [path.read_text(encoding="utf-8") for path in files if path.suffix == ".py"]
+    trees = [node for text in texts for node in ast.walk(ast.parse(text))]
+    own = {node.id for node in trees if isinstance(node, ast.Name)}
+    own |= {node.arg for node in trees if isinstance(node, ast.arg | ast.keyword) and node.arg}
+    own |= {path.stem for path in files}
+    installed = set(packages_distributions()) | set(sys.stdlib_module_names)
+    return (own | installed | set(keyword.kwlist)) - {EXAMPLE}
 
 
 def _is_source(path: Path) -> bool:

@@ -1098,3 +1098,16 @@ def test_a_short_word_asks_for_help(command: str) -> None:
     whole, short = (CliRunner().invoke(cli.app, [*command.split(), word]).output for word in ("--help", "-h"))
     assert whole == short
     assert whole.startswith("Usage:")
+
+
+@pytest.mark.parametrize("name", ["control", "malta", "numpy", "json", "class", "spec", "notebook", "par"])
+def test_a_new_machine_takes_no_name_that_its_files_need(
+    name: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder of that name would stand before the module, or a line of the notebook means something else."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("new", name)
+    assert (code, out, list(tmp_path.iterdir())) == (2, "", [])
+    assert one_sentence(err).startswith(
+        f"malta new: NAME: found {name!r}, which Python, the module or the notebook has"
+    )
