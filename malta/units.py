@@ -209,6 +209,9 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
         raise InputError(where, f"{name}.unit", _quote(unit), expected, units_like(unit, si_unit)) from error
     si_factor, si_root = _root_units(si_unit)
     if found_root != si_root:
+        if "radian" in si_root and found_root == {key: n for key, n in si_root.items() if key != "radian"}:
+            turns = re.sub(r"\b[a-zA-Z]*Hz\b", lambda hertz: f"{hertz[0][:-2]}turn/s", unit)
+            expected += f", as {turns}" if turns != unit and is_unit_of(turns, si_unit) else ""
         raise InputError(where, f"{name}.unit", _quote(unit), expected, units_like(unit, si_unit))
     ratio: float = factor / si_factor
     whole = round(1 / ratio) if ratio < 1 else 0
@@ -241,6 +244,22 @@ def unit_factor(unit: str, name: str) -> float:
         return float(factor / 1000.0 ** float(root.get("gram", 0)))  # the root of mass is the gram
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise InputError("data", name, _quote(unit), "a unit") from error
+
+
+@cache
+def si_unit_of(unit: str) -> str:
+    """The SI unit of the dimension of a unit: itself where it is one. Raises InputError for an unknown unit.
+
+    >>> [si_unit_of(unit) for unit in ("mm/s^2", "T", "g", "kHz")]
+    ['m/s^2', 'T', 'kg', '1/s']
+    """
+    if unit_factor(unit, "unit") == 1:
+        return unit
+    powers = base_exponents(unit)
+    above = " ".join(name if power == 1 else f"{name}^{power}" for name, power in powers.items() if power > 0)
+    below = [name if power == -1 else f"{name}^{-power}" for name, power in powers.items() if power < 0]
+    under = f"({' '.join(below)})" if len(below) > 1 else "".join(below)
+    return (above or "1") + (f"/{under}" if under else "")
 
 
 @cache

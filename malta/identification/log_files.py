@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.errors import InputError
+from malta.errors import InputError, relocate_errors
 from malta.files import read_file, read_packaged, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
@@ -27,7 +27,7 @@ from malta.model.plant import Signal
 from malta.simulation.engine.compiled import address_of, library
 from malta.simulation.engine.sample_loops import SAMPLE_LOOP_FLAGS
 from malta.tables import read_npz
-from malta.units import is_unit_of, to_si
+from malta.units import is_unit_of, si_unit_of, to_si
 from malta.writing import replace_files
 
 VERSION = 1
@@ -86,7 +86,10 @@ def _head(log: Log) -> dict[str, str]:
 def _one_table(log: Log) -> tuple[list[str], FloatArray]:
     """Headings with prefixes, and all columns beside t."""
     present = [group for group in GROUPS if log.names(group)]
-    headings = ["t [s]", *(GROUPS[g] + name for g in present for name in _headings(log, g))]
+    headings = [
+        "t [s]",
+        *(_prefix_of(g, heading, log.source) + heading for g in present for heading in _headings(log, g)),
+    ]
     return headings, np.column_stack([log.t, *(log.columns[group] for group in present)])
 
 
@@ -180,7 +183,8 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     groups : of its columns that are read, as ("y", "i"): of large files some take less time than all
 
     Returns a Log. Signals of headings without a prefix are found by their unit when the log is used. Positions and
-    angles are measured outputs, forces and torques commands, currents and voltages those of the axes.
+    angles are measured outputs, forces and torques commands, currents and voltages those of the axes. Others have a
+    prefix, as "y.a [m/s^2]" of a measured acceleration, "v.u [V]" of a commanded voltage, "ref." or "flag.".
 
     Raises InputError: no such file, another suffix, damage, headings that are no "name [unit]", times that do not rise.
 
@@ -323,7 +327,8 @@ def _tables_of(head: dict[str, Any], names: list[str], columns: list[FloatArray]
     scale = to_si(1.0, _parts(names[0], path)[1], "s", path, "t")
     tables = {group: np.column_stack([columns[k] for k in found]) for group, found in places.items()}
     headings = {
-        group: [names[k].removeprefix(GROUPS[group]) for k in found] for group, found in places.items()
+        group: [names[k].removeprefix(GROUPS[group] or f"{group}.") for k in found]
+        for group, found in places.items()
     }
     return head, columns[0] * scale, tables, headings
 
@@ -336,15 +341,28 @@ def _require_times(names: list[str], path: Path) -> None:
 def _group_of(heading: str, path: Path) -> str:
     """The group of a column of a .csv by its prefix, or by its unit."""
     for group, prefix in GROUPS.items():
-        if prefix and heading.startswith(prefix):
+        if heading.startswith(prefix or f"{group}."):
             return group
     unit = _parts(heading, path)[1]
+    found = _group_by_unit(unit)
+    if not found:
+        expected = "one of m, rad, N, N m, A, V, or a prefix as y., ref. or flag."
+        raise InputError(path, heading, f"unit {unit!r}", expected)
+    return found
+
+
+def _group_by_unit(unit: str) -> str:
+    """The group of a column without a prefix; "" for another unit than those that tell one."""
     for si_unit, group in (("m", "y"), ("rad", "y"), ("N", "v"), ("N m", "v"), ("A", "i"), ("V", "u")):
         if is_unit_of(unit, si_unit):
             return group
-    raise InputError(
-        path, heading, f"unit {unit!r}", "one of m, rad, N, N m, A, V, or a prefix as ref. or flag."
-    )
+    return ""
+
+
+def _prefix_of(group: str, heading: str, path: str) -> str:
+    """What stands before a heading in a file that is one table: nothing where its unit tells the group."""
+    told = _group_by_unit(_parts(heading, Path(path))[1]) == group
+    return GROUPS[group] or ("" if told else f"{group}.")
 
 
 def _parts(heading: str, path: Path) -> tuple[str, str]:
@@ -365,7 +383,8 @@ def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArr
         name, unit = _parts(heading, path)
         si_unit = next((one for one in SI_UNITS if is_unit_of(unit, one)), None)
         if si_unit is None:
-            raise InputError(path, heading, f"unit {unit!r}", "one of " + ", ".join(SI_UNITS))
+            with relocate_errors(path, heading):
+                si_unit = si_unit_of(unit)
         factors.append(to_si(1.0, unit, si_unit, path, name))
         signals.append(Signal(name, si_unit))
     if any(factor != 1 for factor in factors):
