@@ -14,10 +14,13 @@ import malta
 from malta.linear.matrices import eigenvalues
 from malta.loops.sampled_loops import machine_loop
 from malta.margins.verify import machine_report
+from malta.model import Signal
+from malta.report.figures.drawing import front_lines
 from malta.synthesis.spec import Spec
 from malta.tuning.groups import figures_of, groups_of
 from malta.tuning.search import Effort
 from malta.tuning.tune import problem_sha256
+from malta.units import to_si
 
 DESIGNS = ("magnet", "with_current")  # square, and with two outputs for one input
 OVER = {"L_s": (0.01, 0.04)}
@@ -92,3 +95,20 @@ def test_the_margin_of_a_trial_is_that_of_the_worst_value_of_its_intervals(widen
 def test_other_intervals_are_another_search(widened: Path) -> None:
     asked = {"margin": 1.0}
     assert problem_sha256(spec_of("magnet", asked)) != problem_sha256(spec_of("magnet", asked, widened))
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown"), [("V", (1e3, "mV")), ("A", (1.0, "A")), ("m/s^2", (1.0, "m/s^2"))]
+)
+def test_the_front_shows_motions_of_any_unit(unit: str, shown: tuple[float, str]) -> None:
+    """Its table and its picture: a search whose bound was in mV ended in a KeyError, with nothing written."""
+    plant = spec_of("with_current", {}).plant
+    plant = replace(plant, outputs=(plant.outputs[0], Signal("i_y", unit)))
+    assert front_lines(plant, ["motion i_y"], "motion") == [("motion i_y", "i_y", *shown)]
+
+
+@pytest.mark.parametrize(("unit", "turns"), [("Hz", "turn/s"), ("kHz", "kturn/s")])
+def test_a_frequency_without_its_angle_is_answered_with_turns(unit: str, turns: str) -> None:
+    with pytest.raises(malta.InputError, match=f"found '{unit}', expected a unit of rad/s, as {turns}$"):
+        to_si(1.0, unit, "rad/s", "design.toml", "bandwidth")
+    assert to_si(1.0, turns, "rad/s", "", "") == pytest.approx(2 * np.pi * (1e3 if unit == "kHz" else 1))

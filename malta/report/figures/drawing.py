@@ -427,6 +427,7 @@ def merits_phrase(cases: Sequence[Case], which: int) -> str:
 UNITS = {
     "m": (1e6, "um"),
     "rad": (1e6, "urad"),
+    "V": (1e3, "mV"),
     **ROOTS,
     "rad/s": (1.0, "rad/s"),
     "N": (1.0, "N"),
@@ -443,7 +444,7 @@ def front_lines(plant: Plant, names: Iterable[str], trade: Trade) -> list[tuple[
         if base in known and known[base].trade == trade:
             r = known[base]
             unit = next((s.unit for s in r.signals(plant) if s.name == signal), r.unit)
-            found.append((name, signal or r.heading, *UNITS[unit]))
+            found.append((name, signal or r.heading, *UNITS.get(unit, (1.0, unit))))
     return found
 
 
