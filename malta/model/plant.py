@@ -311,10 +311,14 @@ class Plant:
         if self.has_stroke:
             rows.append(("stroke", f"{self.stroke.name}, {quantity(self.stroke.travel, 'm')} either way"))
         rows.append(("contacts", " ".join(self.contacts.names) or "none"))
+        coil = self.actuator.coils[0].unit if self.actuator.coils else "A"
         limits = (
             quantity(limit, s.unit) for limit, s in zip(self.actuator.force_limit, self.inputs, strict=False)
         )
-        rows += [("limits", ", ".join(limits)), ("current limit", quantity(self.actuator.current_limit, "A"))]
+        rows += [
+            ("limits", ", ".join(limits)),
+            ("current limit", quantity(self.actuator.current_limit, coil)),
+        ]
         return Description(f"Plant {self.name!r}, preset {self.parameters.preset!r}", tuple(rows))
 
 

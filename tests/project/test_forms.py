@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import control
 import numpy as np
 import pytest
 from conftest import ROOT
+from scipy.io import loadmat, savemat
 
 import malta
 from malta import structured
@@ -94,3 +96,19 @@ def test_complex_numbers_are_refused_by_name(name: str) -> None:
         malta.InputError, match=rf"{name}.*found complex numbers, as \S*50j, expected real numbers"
     ):
         REFUSING[name]()
+
+
+def test_limits_of_commands_have_the_unit_of_the_commands() -> None:
+    for name, limit in (("magnet", "12 V"), ("ball", "1.5 A")):
+        plant = malta.read_design(ROOT / "examples" / name / "design" / f"{name}.toml").plant
+        assert dict(plant.description.rows)["current limit"] == limit
+
+
+def test_matrices_of_matlab_are_a_system_as_the_page_says(tmp_path: Path) -> None:
+    """savemat writes numbers as 1 x 1, as MATLAB does."""
+    page = (ROOT / "docs" / "howto" / "matlab.md").read_text(encoding="utf-8")
+    assert "`control.ss(A, B, C, D, Ts.item())`" in page
+    savemat(tmp_path / "K.mat", {"A": [[0.5]], "B": [[1.0]], "C": [[2.0]], "D": [[0.1]], "Ts": 1e-3})
+    found = loadmat(tmp_path / "K.mat")
+    law = control.ss(found["A"], found["B"], found["C"], found["D"], found["Ts"].item())
+    assert (law.dt, law.D.tolist()) == (1e-3, [[0.1]])
