@@ -71,9 +71,9 @@ def test_what_is_left_out_is_in_the_middle() -> None:
     [
         (["simulate"], "Missing argument 'GAINS'; see malta simulate --help"),
         (["simulate", TABLE2, "--nothing"], "No such option: --nothing"),
-        (["simulate", TABLE2, "--seed", "x"], "Invalid value for '--seed'"),
+        (["simulate", TABLE2, "--seed", "x"], "--seed: found 'x', expected a whole number"),
         (["simulate", TABLE2, "--seed"], "--seed"),
-        (["tune", "a.toml", "--front", "-1"], "Invalid value for '--front'"),
+        (["tune", "a.toml", "--front", "-1"], "--front: found '-1', expected a number greater than or equal to 0"),
         (["zzz"], "No such command 'zzz'; see malta --help"),
         ([LONG], "No such command 'www"),
         ([""], "No such command ''"),

@@ -201,7 +201,7 @@ LAWS: dict[str, tuple[Any, str]] = {
     "a response": (control.frd([-2 + 1j], [1.0]), "law: found a FrequencyResponseData"),
     "None": (None, "law: found None, expected a Compensator"),
     "a string": ("a", "law: found 'a', expected a Compensator"),
-    "complex": ([[1j]], r"law: found \[\[1j\]\], expected a Compensator"),
+    "complex": ([[1j]], r"law: found complex numbers, as 0\+1j, expected real numbers"),
     "three dimensions": (np.zeros((1, 1, 1)), "law: found a value of type ndarray"),
     "NaN": ([[math.nan]], "law: found NaN or infinity"),
     "a function": (len, "law: found a value of type builtin_function_or_method"),
