@@ -29,7 +29,7 @@ on what it prints, and free ones, which are ours. The tables name them all, and 
 half as large, the others as shipped. `python docs/free_numbers.py` computes the page.
 
 The figures are the peak of |S| at the worst sensor, the last crossover of the loop (rad/s), and how far 1 N along x
-moves an output (µm). For MALTA there are also K1/k, the stiffness of the LQR over that of the attraction, and the
+or y moves an output (µm). For MALTA there are also K1/k, the stiffness of the LQR over that of the attraction, and the
 deviation of sensor plane 2 in Fig. 16 without noise (SP2, µm; the paper has less than 4). An entry such as "2.4 / 2.2"
 is of twice and of half the number, or of the other choices in their order. "–" is a figure that keeps its three digits.
 """
@@ -197,8 +197,11 @@ def figures_of(spec: Spec) -> Figures | None:
     if not report.stable:
         return None
     peak = max(value for name, value in report.peak_sensitivity.items() if name != "sigma_max")
-    (pushed,) = recovery(plant, law, {"load": {"F_x": 1.0}})
-    moved = 1e6 * max(d.largest for d, s in zip(pushed.outputs, plant.outputs, strict=True) if s.unit == "m")
+    sideways = {s.name for s in plant.disturbances} & {"F_x", "F_y"}
+    pushed = recovery(plant, law, {name: {name: 1.0} for name in sorted(sideways)})
+    moved = 1e6 * max(
+        d.largest for one in pushed for d, s in zip(one.outputs, plant.outputs, strict=True) if s.unit == "m"
+    )
     common = (peak, report.bandwidth["crossover_max"], moved)
     if plant.name != "tubular":
         return common

@@ -12,6 +12,7 @@ from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
 from malta.loops.sampled_loops import machine_loop
+from malta.loops.time_domain import recovery
 from malta.machines.tubular import paper as tubular
 from malta.machines.tubular.paper.quantities import (
     axial_deviation,
@@ -349,4 +350,7 @@ def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: TubularEvid
     assert load_deviation("centre of gravity", None, found) == pytest.approx(6.418e-6, rel=1e-3)
     assert load_deviation("bearing", None, found) == pytest.approx(12.503e-6, rel=1e-3)
     assert load_deviation("bearing", 0.1, found) < 1e-9
+    along = {axis: {f"F_{axis}": 1.0} for axis in "xy"}
+    apart = [max(d.largest for d in one.outputs) for one in recovery(plant, found.controller, along)]
+    assert load_deviation("centre of gravity", None, found) == pytest.approx(max(apart), rel=1e-12)
     assert axial_deviation(found).largest == pytest.approx(93.58e-6, rel=1e-3)

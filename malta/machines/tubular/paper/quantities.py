@@ -371,15 +371,21 @@ def noise_forces(e: TubularEvidence) -> tuple[float, float]:
 def load_deviation(name: str, after: float | None, e: TubularEvidence) -> float:
     """How far a load of LOADS moves an output, m: at most, or from `after` (s) on; at the operating point."""
     plant, par = e.model.plant, e.spec.parameters
-    load = {key: size(par) for key, size in LOADS[name].items()}
-    (found,) = recovery(plant, e.controller, {name: load}, after=() if after is None else (after,))
-    return max(d.largest if after is None else d.left[0] for d in found.outputs)
+    loads = {
+        axis: {key: size(par) for key, size in load.items()}
+        for axis, load in zip("xy", LOADS[name], strict=True)
+    }
+    found = recovery(plant, e.controller, loads, after=() if after is None else (after,))
+    return max(d.largest if after is None else d.left[0] for one in found for d in one.outputs)
 
 
-# N and N m by disturbance, of the parameters: 1 N at a point of the mover.
-LOADS: dict[str, dict[str, Callable[[Any], float]]] = {
-    "centre of gravity": {"F_x": lambda _: 1.0},
-    "bearing": {"F_x": lambda _: 1.0, "T_y": lambda par: par.l_B},
+# N and N m by disturbance, of the parameters: 1 N at a point of the mover, along x and along y.
+LOADS: dict[str, tuple[dict[str, Callable[[Any], float]], ...]] = {
+    "centre of gravity": ({"F_x": lambda _: 1.0}, {"F_y": lambda _: 1.0}),
+    "bearing": (
+        {"F_x": lambda _: 1.0, "T_y": lambda par: par.l_B},
+        {"F_y": lambda _: 1.0, "T_x": lambda par: -par.l_B},
+    ),
 }
 
 
