@@ -73,7 +73,10 @@ def test_what_is_left_out_is_in_the_middle() -> None:
         (["simulate", TABLE2, "--nothing"], "No such option: --nothing"),
         (["simulate", TABLE2, "--seed", "x"], "--seed: found 'x', expected a whole number"),
         (["simulate", TABLE2, "--seed"], "--seed"),
-        (["tune", "a.toml", "--front", "-1"], "--front: found '-1', expected a number greater than or equal to 0"),
+        (
+            ["tune", "a.toml", "--front", "-1"],
+            "--front: found '-1', expected a number greater than or equal to 0",
+        ),
         (["zzz"], "No such command 'zzz'; see malta --help"),
         ([LONG], "No such command 'www"),
         ([""], "No such command ''"),
