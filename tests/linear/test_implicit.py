@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import pickle
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 import pytest
-from flint import acb, arb, ctx
+from flint import acb, acb_mat, arb, ctx
 from hypothesis import given, settings, strategies as st
 from scipy.optimize import brentq
 
 from malta.linear.branches import INTERVALS, Interval
 from malta.linear.expressions import BALLS, POINTS, MatrixProgram, NotAnalytic, program
-from malta.linear.implicit import call, implicit_function
+from malta.linear.implicit import ImplicitRoot, call, implicit_function, root_equations
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -67,6 +68,8 @@ def test_a_square_root_over_discs_is_that_of_each_point() -> None:
     for angle in np.linspace(0, 2 * np.pi, 17):
         z = acb(1.5 + 0.39 * np.cos(angle), 0.39 * np.sin(angle))
         assert found.contains(z.sqrt())
+    for corner in (1.1 + 0.4j, 1.1 - 0.4j, 1.9 + 0.4j, 1.9 - 0.4j):  # of the rectangle that the ball is
+        assert found.contains(acb(corner).sqrt())
     assert float(abs(found - acb(1.5).sqrt()).upper()) < 0.5
 
 
@@ -93,6 +96,62 @@ def test_one_branch_on_either_side_of_what_is_no_rest() -> None:
         assert real.high - real.low < 0.2
     with pytest.raises(NotAnalytic, match="root of equations"):
         on_interval(model, (-0.6, -0.5), (-0.05, 0.05))
+
+
+def test_a_line_beside_what_is_no_rest_is_not_all_lines() -> None:
+    """The line to the middle of a ball passes p = 0, lines to its points do not: one root, and no one function."""
+    function, _ = root_program(complex_square, [1.0, 0.0], [1.0, 0.0])
+    equations, nominal, near = root_equations(function.get_function(function.get_function()[-1]))
+    root = ImplicitRoot(slopes_of(equations), lambda p: np.array(function(p)).ravel(), nominal, near)
+    P = [acb(arb(-0.55, 0.05)), acb(arb(0.1, 0.15))]
+    found = root.enclose(P)
+    assert found is not None
+    assert found[0].contains(np.sqrt(-0.55 + 0.1j).real)
+    assert root.enclose(P, is_one=False) is None
+
+
+def slopes_of(equations: ca.Function) -> Callable[[Any, Any], Any]:
+    """F, F_r and F_p over balls."""
+    model = program(equations).only((0, 1, 2))
+
+    def at(p: Any, r: Any) -> Any:
+        found = [acb_mat(*shape) for shape in model.shapes[:3]]
+        for matrix, own in zip(found, model.run([*p, *r], BALLS), strict=False):
+            for i, j, x in own:
+                matrix[i, j] = x
+        return tuple(found)
+
+    return at
+
+
+def signed_root(sign: int, p: Any) -> Any:
+    return sign * np.sqrt(p)
+
+
+def test_a_root_that_a_search_mistakes_is_no_enclosure() -> None:
+    """Newton's method from the other root finds the other root: where it is not that of nominal p, there is none."""
+    _, model = root_program(square, [1.0], [1.0])
+    (*_, value) = next(step for step in model.steps if step[0] == "root")
+    equations, nominal, near = root_equations(value.function)
+    for sign in (1, -1):
+        for is_one in (True, False):
+            root = ImplicitRoot(slopes_of(equations), partial(signed_root, sign), nominal, near)
+            for ball in (acb(3.0), acb(arb(3.0, 0.2)), acb(arb(3.0, 0.1), arb(0, 0.1 * is_one))):
+                found = root.enclose([ball], is_one=is_one)
+                assert (found is not None) == (sign > 0)
+                assert found is None or found[0].contains(acb(3.0).sqrt())
+
+
+def test_the_radius_of_a_root_covers_what_the_slope_leaves_open() -> None:
+    """F = 0.1 in the middle, where F' = 1, and F' from 0.6 to 1.4 about it: the root is up to 0.1 / 0.6 away."""
+
+    def equations(_: Any, r: Any) -> Any:
+        wide = r[0].real.rad() > 0
+        return acb_mat([[0.1]]), acb_mat([[acb(arb(1, 0.4 if wide else 0))]]), acb_mat([[0]])
+
+    root = ImplicitRoot(equations, np.zeros_like, np.zeros(1), np.zeros(1))
+    assert root.start is not None
+    assert 0.1 / 0.6 <= float(root.start.most[0]) < 0.3
 
 
 @settings(max_examples=40, deadline=None)
