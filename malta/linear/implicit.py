@@ -26,11 +26,8 @@ from malta.work import check_clock
 
 PREFIX = "root_"  # of the names of these functions
 EQUATIONS = "equations"
-STAGES, STEPS, LAST_STEPS = (
-    4,
-    2,
-    8,
-)  # parts of the line to p, with steps of Newton's method each, and at its end
+STAGES = 4  # parts of the line to p
+STEPS, LAST_STEPS = 2, 8  # of Newton's method, in each of them and at the end
 STILL_SHARE = 1e-5  # of the unknowns: a last step below this is one that found a root
 TRIES = 6  # of radii of a tube
 GROWTH = 1.25  # of these from one try to the next
@@ -44,9 +41,8 @@ LOOSE_BITS = 44  # that are enough in the middle of a region: a root in floating
 WIDENING = 1.0625  # times a region that further balls will be in
 
 Slopes = tuple[Any, Any, Any]  # F (k x 1), F_r (k x k), F_p (k x n) as acb_mat
-Equations = Callable[
-    [Sequence[Any], Sequence[Any]], "Slopes | None"
-]  # at balls of p and r; None where not analytic
+# at balls of p and r; None where they are not analytic
+Equations = Callable[[Sequence[Any], Sequence[Any]], "Slopes | None"]
 
 
 def implicit_function(rows: Any, p: Any, r: Any, nominal: FloatArray, near: FloatArray) -> ca.Function:
@@ -140,8 +136,8 @@ class ImplicitRoot:
         """An enclosure of r over balls of p; None where it is not proven that there is one function.
 
         p : n complex balls
-        is_one : whether p is among real balls that were enclosed before, where the function is known to be one: then
-            the line to its middle is enough. Else all lines are looked at.
+        is_one : whether the middle of p is among real balls that were enclosed before, where the function is known to
+            be one: then the line to it is enough. Else all lines are looked at.
         """
         P = tuple(acb(x) for x in p)
         check_clock()
@@ -173,7 +169,7 @@ class ImplicitRoot:
     def _by_halves(self, P: tuple[Any, ...], *, is_one: bool) -> list[Any] | None:
         """An enclosure by those over parts of P, whose roots agree on what they share; None for too many parts."""
         tubes = self._cover(P, None, MOST_HALVES) if is_one and self._has_ends(P) else None
-        m = _middle(P)
+        m = _real_middle(P)
         own = None if tubes is None else next((tube for tube in tubes if _contains(tube.region, m)), None)
         if tubes is None or own is None or not self._is_linked(own, m):
             return None
@@ -230,12 +226,12 @@ class ImplicitRoot:
         return whole if last is not None and self._are_same(last, whole, _middle(P)) else None
 
     def _reach_along(self, P: tuple[Any, ...]) -> RootTube | None:
-        """A tube over P whose root is that of the nominal p along the line to its middle."""
+        """A tube over P whose root is that of the nominal p along the line to its middle, which has to be real."""
         whole = self._whole(P)
-        return whole if whole is not None and self._is_linked(whole, _middle(P)) else None
+        return whole if whole is not None and self._is_linked(whole, _real_middle(P)) else None
 
     def _is_linked(self, tube: RootTube, m: tuple[Any, ...]) -> bool:
-        """Whether the root of a tube at a point m is that of the nominal p along the line from there."""
+        """Whether the root of a tube at a real point m is that of the nominal p along the line from there."""
         tubes = (*self.known, *self.along)
         last = next((one for one in tubes if _contains(one.region, m)), None)
         if last is None and self.start is not None:
@@ -293,7 +289,8 @@ class ImplicitRoot:
     ) -> RootTube | None:
         """A tube over P about the root in its middle that Newton's method finds from there; None where there is none.
 
-        bits : that its radius has at least, of the root's size; None: half of them
+        bits : of rounding that its radius has at least, as units in the last place of the root; None: many, for a tube
+            that others are compared with
         """
         m = _middle(P)
         middle = self._centre(m, start.centre(m) if isinstance(start, RootTube) else start, bits)
@@ -348,6 +345,11 @@ class ImplicitRoot:
 
 def _middle(p: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(acb(x.real.mid(), x.imag.mid()) for x in p)
+
+
+def _real_middle(p: Sequence[Any]) -> tuple[Any, ...]:
+    """The middle without imaginary parts: around complex points a line from nominal p may pass either side of one."""
+    return tuple(acb(x.real.mid()) for x in p)
 
 
 def _are_real(values: Sequence[Any]) -> bool:

@@ -189,7 +189,7 @@ PARTS = 256  # parts of a box on which conditions are looked at
 BISECTIONS = 30  # of the box in which they hold
 SHARES_OF_END = (1.0, 0.999, 0.99, 0.97, 0.93, 0.85, 0.7, 0.5, 0.25, 0.1, 0.01)  # of where a corner fails
 NO_ONE_REST = "it is not proven that there is one rest"
-BEYOND_LOSS = 1.02  # times the first loss that poles show
+BEYOND_LOSS = 1.01  # times the first loss that poles show, up to which a dear box is looked at
 BEYOND_SHARE = 1e-3  # of a box: how far beyond its end a condition is looked for that fails there
 MOST_CORNERS = 12  # parameters of whose corners all are looked at
 

@@ -19,10 +19,9 @@ import numpy as np
 from malta.linear.branches import BranchCase, Interval
 from malta.linear.expressions import program
 from malta.linear.uncertain import UncertainSystem
-from malta.proof.box import Box, every_part, last_passed
+from malta.proof.box import BEYOND_LOSS, Box, every_part, last_passed
 from malta.proof.margin import IDLE_TEXT, Margin
 
-BEYOND_LOSS = 1.01  # times the first loss that poles show, up to which cases are looked at
 PARTS_ASKED = 4  # parts of a box on which a case is asked for where it may act
 CUTS = 12  # bisections of the end of such a part
 PART_LIMIT = 1.05  # of such a part, which is asked for as a whole

@@ -81,6 +81,8 @@ def test_no_function_where_two_roots_meet() -> None:
             on_interval(model, side)
     with pytest.raises(NotAnalytic, match="root of equations"):
         model.run([acb(arb(0.2, 0.3), arb(0, 0.3))], BALLS)
+    with pytest.raises(NotAnalytic, match="root of equations"):  # on one side of it, off the real axis
+        model.run([acb(-0.2, 0.2)], BALLS)
     assert np.isnan(float(function(-0.2)))
     assert float(function(0.04)) == pytest.approx(0.2, rel=1e-9)
 
