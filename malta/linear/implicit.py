@@ -6,7 +6,8 @@ parameters it is enclosed in tubes c + S (p - m) + w, each with exactly one root
     |Y F(p, c + S (p - m))| + |1 - Y F_r| w < w        Y: about F_r^-1;  S: about -Y F_p
 
 The regions cover the convex hull of p_0 and P, and two that follow each other have the same root at a point of both.
-So r is one analytic function there, and of all balls that are enclosed the same.
+So r is one analytic function there, and of all balls that are enclosed the same. Once all of a real box is enclosed so,
+the line from p_0 to a point of the box is enough for a ball about it, complex ones included: the box is convex.
 """
 
 from __future__ import annotations
