@@ -398,7 +398,7 @@ def _call(flat: ca.Function, operands: list[int], index: int, steps: list[Step])
     for place, k in enumerate(operands):
         value = steps[k][3] if steps[k][0] == "const" else -1.0
         name = f"{PREFIX}{value:.0f}"
-        if value == round(value) and flat.has_function(name):
+        if value == round(value) and name in flat.get_function():
             function = flat.get_function(name)
             if function.numel_in(0) == place and index < function.numel_out(0):
                 return ("root", 0, tuple(operands[:place]), RootEntry(function, index))

@@ -241,7 +241,10 @@ def _implicit(rows: Any, unknowns: Unknowns) -> Formula:
     own, at = ca.vertcat(p, symbols), ca.vertcat(p, *(before[k] for k in inner))
     acts = [k for k, yes in enumerate(ca.which_depends(left, own, 1, False)) if yes]
     values = np.array(ca.Function("at", [p], [ca.densify(at)])(nominal)).ravel()
-    found = call(implicit_function(left, own[acts], r, values[acts], near), at[acts])
+    root = implicit_function(left, own[acts], r, values[acts], near)
+    found = call(root, at[acts])
+    if root.name() not in ca.Function("found", [p], [found]).get_function():
+        raise NotAnalytic("a call that CasADi before 3.8 does not keep")  # its steps would pass for a formula
     branches = [ca.substitute([before[k]], [r], [found])[0] for i, _, k in model.entries[-1] if i < count]
     exists = ca.exp(ca.atan(found[0]))  # above zero wherever there is a root
     return Formula(found, (Condition(exists), *(Condition(one) for one in branches)))
