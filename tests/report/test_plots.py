@@ -171,6 +171,18 @@ def test_a_root_locus_mirrors_and_its_branches_have_no_gaps(name: str) -> None:
         assert np.nanmax(step / size, initial=0.0) < 0.2
 
 
+def test_a_margin_map_has_powers_of_ten_with_the_unit() -> None:
+    """C is 20 millionths: beside the ticks the power would stand on the legend."""
+    spec = malta.read_design("examples/ball/design/ball.toml")
+    controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    figure = report.margin_map(margin_map_of(spec.plant, controller, ("m", "C"), {"m": 0.2, "C": 0.2}))
+    (panel,) = figure.axes
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("m [kg]", "C [1e-6 N m^2/A^2]")
+    figure.canvas.draw()
+    assert panel.yaxis.get_offset_text().get_text() == ""
+    assert "20" in [text.get_text() for text in panel.get_yticklabels()]
+
+
 def test_a_margin_map_proves_no_unstable_machine_and_meets_its_witness() -> None:
     """Two routes: no eigenvalue in the proven box is unstable, and the witness lies on the boundary that they show."""
     controller = malta.gains.read(GAINS / "halbach.json")

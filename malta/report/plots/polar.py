@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -439,15 +440,28 @@ def _runs_of(found: MarginMap, campaign: Campaign | Summary) -> Iterator[FloatAr
         yield points[chosen] if varied else points[:0]
 
 
+def _multiple_text(size: float, v: float, _: int) -> str:
+    """The number at a tick in multiples of a power of ten."""
+    return f"{v / size:g}"
+
+
+MAX_PLAIN_POWER = 3  # of ten, either way, without which numbers at an axis are written
+
+
 def _finish(axes: Axes, found: MarginMap) -> None:
-    """Axes as wide as the grid, with units."""
+    """Axes as wide as the grid, with units, and a power of ten with these where numbers would be long."""
     axes.set_xlim(found.x_values[0], found.x_values[-1])
     axes.set_ylim(found.y_values[0], found.y_values[-1])
-    for set_label, name, unit in (
-        (axes.set_xlabel, found.x, found.units[0]),
-        (axes.set_ylabel, found.y, found.units[1]),
+    for axis, name, unit, values in (
+        (axes.xaxis, found.x, found.units[0], found.x_values),
+        (axes.yaxis, found.y, found.units[1], found.y_values),
     ):
-        set_label(plain(f"{name} [{'-' if unit == '1' else unit}]"))
+        power = 3 * math.floor(math.log10(max(abs(float(values[0])), abs(float(values[-1])), 1e-300)) / 3)
+        own = [] if unit == "1" else [unit]
+        if abs(power) > MAX_PLAIN_POWER:
+            axis.set_major_formatter(partial(_multiple_text, 10.0**power))
+            own.insert(0, f"1e{power}")
+        axis.set_label_text(plain(f"{name} [{' '.join(own) or '-'}]"))
     draw_grid(axes)
     if not found.growth.max() > 0:
         axes.annotate(
