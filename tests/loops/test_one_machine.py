@@ -166,7 +166,7 @@ def test_the_loop_of_any_magnet_is_the_derivative_of_its_flight(
     assert distance(poles(ours.closed, c.sample_time), poles(flown, c.sample_time)) < SAME
 
 
-@pytest.mark.parametrize("name", [name for name in MACHINES if name != "three coils"])
+@pytest.mark.parametrize("name", MACHINES)
 def test_the_proven_loop_of_any_magnet_is_the_derivative_of_its_flight(name: str) -> None:
     """In its parameters, under spring and weight."""
     plant, c, at = bench_loop(name, 1, 0.0, 1.1)
