@@ -296,10 +296,13 @@ def _usage_text(error: Any) -> str:
     refused = getattr(error.__context__, "errors", None)  # of the library that reads values
     if refused is None or error.param is None:
         return str(error.format_message().rstrip("."))
-    first = refused()[0]
+    first, option = refused()[0], error.param.opts[0]
+    name = option if option.startswith("-") else (error.param.metavar or option.upper()).strip("[].")
+    if first["type"] == "value_error":  # of a path that none can be
+        found = f"{first['input']!r}, {first['msg'].removeprefix('Value error, ')}"
+        return str(InputError(name, "", found, "a value without it"))
     limit = first["msg"].removeprefix("Input should be ")
     expected = NUMBER_TEXTS.get(first["type"], f"a number {limit}" if "than" in limit else limit)
-    name = error.param.opts[0] if error.param.opts[0].startswith("-") else error.param.make_metavar(error.ctx)
     return str(InputError(name, "", repr(first["input"]), expected))
 
 

@@ -77,6 +77,8 @@ def test_what_is_left_out_is_in_the_middle() -> None:
             ["tune", "a.toml", "--front", "-1"],
             "--front: found '-1', expected a number greater than or equal to 0",
         ),
+        (["log", "a\x00b"], "LOG: found 'a\\x00b', embedded null byte, expected a value without it"),
+        (["design", "a\x00b"], "DESIGN: found 'a\\x00b', embedded null byte, expected a value without it"),
         (["zzz"], "No such command 'zzz'; see malta --help"),
         ([LONG], "No such command 'www"),
         ([""], "No such command ''"),
