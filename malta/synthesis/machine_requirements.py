@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from malta.synthesis.requirements import SEEDS, Figure, Indices, Requirement, judge_figure, noise_at_rest
+from malta.synthesis.requirements import (
+    SEEDS,
+    Figure,
+    Indices,
+    Requirement,
+    Trade,
+    judge_figure,
+    noise_at_rest,
+)
 
 CONFIDENCE = 0.95  # of the intervals at all of SEEDS together
 
@@ -65,29 +73,18 @@ def reached_with_every_seed(draw: Callable[[int], bool], reached: float, source:
 def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
     """Bound the true motion of some outputs at rest, rms, from the sensors' noise and steps: the worst of them."""
     meaning = f"{heading} motion at rest, rms, from the sensors' noise and steps"
-    return noise_at_rest(
-        name,
-        "motion",
-        lambda plant, _: outputs(plant),
-        unit="m",
-        heading=heading,
-        meaning=meaning,
-        indices=outputs,
-    )
+    return _noise_of(name, "motion", outputs, unit="m", heading=heading, meaning=meaning)
 
 
 def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
     """Bound the noise of some commanded forces at rest, rms: the worst of them."""
     meaning = f"noise of the commanded {heading} at rest, rms"
-    return noise_at_rest(
-        name,
-        "force",
-        lambda plant, _: inputs(plant),
-        unit="N",
-        heading=heading,
-        meaning=meaning,
-        indices=inputs,
-    )
+    return _noise_of(name, "force", inputs, unit="N", heading=heading, meaning=meaning)
+
+
+def _noise_of(name: str, kind: Trade, indices: Indices, **fields: Any) -> Requirement:
+    """A bound of the noise at rest of the signals with these indices in the plant."""
+    return noise_at_rest(name, kind, lambda plant, _: indices(plant), indices=indices, **fields)
 
 
 def worst_merit(experiment: Any) -> float:
