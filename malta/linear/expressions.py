@@ -16,7 +16,7 @@ import casadi as ca
 from flint import acb, acb_mat, arb, fmpq
 
 from malta.errors import InputError
-from malta.linear.implicit import PREFIX, ImplicitRoot, Slopes, call, root_equations, root_value
+from malta.linear.implicit import PREFIX, ImplicitRoot, Slopes, call, root_equations, root_name, root_value
 
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
 FIELD: dict[str, Callable[..., Any]] = {  # operations of any field
@@ -290,7 +290,7 @@ class RootEntry(NamedTuple):
 
     def enclosure(self, p: Sequence[Any], *, is_one: bool = True) -> Any:
         """Its values over complex balls of p: `ImplicitRoot.enclose`. Raises NotAnalytic where they are not known."""
-        found = _enclosed_root(self.function).enclose(p, is_one=is_one)
+        found = enclosed_root(self.function).enclose(p, is_one=is_one)
         if found is None:
             raise NotAnalytic("a root of equations that may end or divide")
         return found[self.place]
@@ -300,7 +300,8 @@ _ROOTS: dict[str, ImplicitRoot] = {}  # by name, in which its equations are coun
 MAX_KEPT_ROOTS = 64
 
 
-def _enclosed_root(function: ca.Function) -> ImplicitRoot:
+def enclosed_root(function: ca.Function) -> ImplicitRoot:
+    """The root that a function of `implicit_function` is, with its equations over balls; remembered by its name."""
     if function.name() not in _ROOTS:
         equations, nominal, near = root_equations(function)
         model = program(equations).only((0, 1, 2))
@@ -370,10 +371,14 @@ def program(function: ca.Function) -> MatrixProgram:
             steps.append((name, 0, (made[source[0]],), value))
         elif name == "call":
             operands = [made[i] for i in source if i >= 0]  # cells that the results may take
-            for index, cell in enumerate(target):
+            root = _called_root(flat, [steps[k] for k in operands])
+            for place, cell in enumerate(target):
                 if cell >= 0:
-                    steps.append(_call(flat, operands, index, steps))
-                    made[cell] = len(steps) - 1
+                    made[cell] = len(steps)
+                    steps.append(
+                        ("call", 0, tuple(operands), 0.0) if root is None or place >= root.numel_out(0)
+                        else ("root", 0, tuple(operands[: root.numel_in(0)]), RootEntry(root, place))
+                    )  # fmt: skip
             continue
         else:
             steps.append(_step(name, [made[i] for i in source[: arity.get(name, len(source))]], steps))
@@ -393,16 +398,18 @@ def program(function: ca.Function) -> MatrixProgram:
     return MatrixProgram(tuple(steps), tuple(entries), shapes, flat.size1_in(0))
 
 
-def _call(flat: ca.Function, operands: list[int], index: int, steps: list[Step]) -> Step:
-    """An entry of a root, whose function the constant behind its parameters names; else a call without enclosure."""
-    for place, k in enumerate(operands):
-        value = steps[k][3] if steps[k][0] == "const" else -1.0
-        name = f"{PREFIX}{value:.0f}"
-        if value == round(value) and name in flat.get_function():
-            function = flat.get_function(name)
-            if function.numel_in(0) == place and index < function.numel_out(0):
-                return ("root", 0, tuple(operands[:place]), RootEntry(function, index))
-    return ("call", 0, tuple(operands), 0.0)
+def _called_root(flat: ca.Function, operands: list[Step]) -> ca.Function | None:
+    """The root that a call is of, which the constant behind its parameters names; None for another call.
+
+    Calls of what CasADi derives of a root have the same constant there, and more operands: values and seeds.
+    """
+    for name in flat.get_function():
+        root = flat.get_function(name) if name.startswith(PREFIX) else None
+        if root is not None and len(operands) == root.nnz_in():
+            key = operands[root.numel_in(0)]
+            if key[0] == "const" and name == root_name(key[3]):
+                return root
+    return None
 
 
 def _step(name: str, operands: list[int], steps: list[Step]) -> Step:

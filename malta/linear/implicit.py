@@ -32,7 +32,7 @@ STEPS, LAST_STEPS = 2, 8  # of Newton's method, in each of them and at the end
 STILL_SHARE = 1e-5  # of the unknowns: a last step below this is one that found a root
 TRIES = 6  # of radii of a tube
 GROWTH = 1.25  # of these from one try to the next
-BEGINNINGS = tuple(k / 16 for k in range(15, 3, -1))  # of what is left of the way to a ball
+BEGINNINGS = tuple(k / 16 for k in range(15, 3, -1))  # of the way to a ball, that a known tube may have
 MOST_SLICES, MIN_SLICE = 64, 2.0**-20  # of the way to a ball, that are tried; and how short one may be
 NEWTON_STEPS = 80  # of a centre, each of which finds some twelve digits
 MOST_HALVES = 5  # times that a ball is cut
@@ -68,7 +68,11 @@ def implicit_function(rows: Any, p: Any, r: Any, nominal: FloatArray, near: Floa
     of = ca.Function(EQUATIONS, [ca.vertcat(p, r)], outputs, {"never_inline": True})
     number = int.from_bytes(hashlib.sha256(of.serialize().encode()).digest()[:6], "big")
     left = of(ca.vertcat(p, s))[0]
-    return ca.Function(f"{PREFIX}{number}", [p, key, s], [value, left], {"never_inline": True})
+    return ca.Function(root_name(number), [p, key, s], [value, left], {"never_inline": True})
+
+
+def root_name(number: float) -> str:
+    return f"{PREFIX}{number:.0f}"
 
 
 def call(root: ca.Function, p: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.optimize import brentq
 
 from malta.linear.branches import INTERVALS, Interval
-from malta.linear.expressions import BALLS, POINTS, MatrixProgram, NotAnalytic, program
-from malta.linear.implicit import ImplicitRoot, call, implicit_function, root_equations
+from malta.linear.expressions import BALLS, POINTS, MatrixProgram, NotAnalytic, enclosed_root, program
+from malta.linear.implicit import ImplicitRoot, call, implicit_function
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -102,9 +103,8 @@ def test_one_branch_on_either_side_of_what_is_no_rest() -> None:
 
 def test_a_line_beside_what_is_no_rest_is_not_all_lines() -> None:
     """The line to the middle of a ball passes p = 0, lines to its points do not: one root, and no one function."""
-    function, _ = root_program(complex_square, [1.0, 0.0], [1.0, 0.0])
-    equations, nominal, near = root_equations(function.get_function(function.get_function()[-1]))
-    root = ImplicitRoot(slopes_of(equations), lambda p: np.array(function(p)).ravel(), nominal, near)
+    function, model = root_program(complex_square, [1.0, 0.0], [1.0, 0.0])
+    root = another_search(model, lambda p: np.array(function(p)).ravel())
     P = [acb(arb(-0.55, 0.05)), acb(arb(0.1, 0.15))]
     found = root.enclose(P)
     assert found is not None
@@ -112,18 +112,10 @@ def test_a_line_beside_what_is_no_rest_is_not_all_lines() -> None:
     assert root.enclose(P, is_one=False) is None
 
 
-def slopes_of(equations: ca.Function) -> Callable[[Any, Any], Any]:
-    """F, F_r and F_p over balls."""
-    model = program(equations).only((0, 1, 2))
-
-    def at(p: Any, r: Any) -> Any:
-        found = [acb_mat(*shape) for shape in model.shapes[:3]]
-        for matrix, own in zip(found, model.run([*p, *r], BALLS), strict=False):
-            for i, j, x in own:
-                matrix[i, j] = x
-        return tuple(found)
-
-    return at
+def another_search(model: MatrixProgram, search: Callable[[Any], Any]) -> ImplicitRoot:
+    """The root in a program without what is known of it, which another search looks for."""
+    (*_, entry) = next(step for step in model.steps if step[0] == "root")
+    return replace(enclosed_root(entry.function), root=search, known=[], along=[], last={})
 
 
 def signed_root(sign: int, p: Any) -> Any:
@@ -133,11 +125,9 @@ def signed_root(sign: int, p: Any) -> Any:
 def test_a_root_that_a_search_mistakes_is_no_enclosure() -> None:
     """Newton's method from the other root finds the other root: where it is not that of nominal p, there is none."""
     _, model = root_program(square, [1.0], [1.0])
-    (*_, value) = next(step for step in model.steps if step[0] == "root")
-    equations, nominal, near = root_equations(value.function)
     for sign in (1, -1):
         for is_one in (True, False):
-            root = ImplicitRoot(slopes_of(equations), partial(signed_root, sign), nominal, near)
+            root = another_search(model, partial(signed_root, sign))
             for ball in (acb(3.0), acb(arb(3.0, 0.2)), acb(arb(3.0, 0.1), arb(0, 0.1 * is_one))):
                 found = root.enclose([ball], is_one=is_one)
                 assert (found is not None) == (sign > 0)
@@ -190,3 +180,9 @@ def test_the_slope_of_a_root_is_no_enclosure() -> None:
     slope = ca.Function("slope", [p], [ca.jacobian(function(p), p)])
     assert float(slope(4.0)) == pytest.approx(0.25, rel=1e-9)
     assert program(slope).foreign == ("call",)
+    for backwards in (True, False):
+        wanted = ca.jtimes(function(p), p, ca.SX(1), backwards)
+        both = program(ca.Function("both", [p], [function(p), wanted]))
+        assert (both.foreign, both.implicit) == (("call",), True)
+        ((*_, value),) = both.only((0,)).run([arb(4.0)], POINTS)[0]
+        assert value.contains(2)
