@@ -187,7 +187,8 @@ def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[
 
 PARTS = 256  # parts of a box on which conditions are looked at
 BISECTIONS = 30  # of the box in which they hold
-SHARES_OF_END = (1.0, 0.999, 0.99, 0.97, 0.93, 0.85, 0.7, 0.5, 0.25, 0.1, 0.01)  # of where a corner fails
+# of where corners fail or poles are lost
+SHARES_OF_END = (1.0, 0.999, 0.99, 0.97, 0.93, 0.85, 0.7, 0.5, 0.25, 0.1, 0.01)
 NO_ONE_REST = "it is not proven that there is one rest"
 BEYOND_LOSS = 1.01  # times the first loss that poles show, up to which a dear box is looked at
 BEYOND_SHARE = 1e-3  # of a box: how far beyond its end a condition is looked for that fails there
@@ -195,7 +196,7 @@ MOST_CORNERS = 12  # parameters of whose corners all are looked at
 
 
 def within_branches(
-    box: Box, system: UncertainSystem, loss: Callable[[Box], float] = lambda box: box.limit
+    box: Box, system: UncertainSystem, loss: Callable[[Box], float] = lambda _: math.inf
 ) -> Box:
     """The box, ended where the conditions of a model (`positive`, p -> values above zero) are no longer proven.
 
@@ -205,20 +206,22 @@ def within_branches(
         return box
     conditions, limit = program(system.positive), box.limit
 
-    def hold(t: float) -> bool:
-        return _failing_corner(box, system, t) is None and _hold(conditions, box.sides(t))
+    def passes(t: float) -> bool:
+        return _failing_corner(box, system, t) is None
 
+    def hold(t: float) -> bool:
+        return passes(t) and _hold(conditions, box.sides(t))
+
+    if not conditions.implicit and hold(limit):
+        return box
     if not hold(0.0):
         return replace(box, most=0.0, ends=_end_at(box, system, 0.0))
-    if any(name == "root" for name, *_ in conditions.steps):
-        last = last_passed(lambda t: _failing_corner(box, system, t) is None, 0.0, limit)
-        last = limit if _failing_corner(box, system, limit) is None else last
+    if conditions.implicit:  # each look at roots of equations is dear
+        last = limit if passes(limit) else last_passed(passes, 0.0, limit)
         near = min(last, BEYOND_LOSS * loss(replace(box, most=last)))
         low = next((t for share in SHARES_OF_END if hold(t := share * near)), 0.0)
         if low < near:
             return replace(box, most=low, ends=NO_ONE_REST)
-    elif hold(limit):
-        return box
     else:
         low = last_passed(hold, 0.0, limit)
     return replace(box, most=low, ends=_end_at(box, system, low))

@@ -303,14 +303,11 @@ def robust_margin(
         found = margin_of(problem, box, effort)
     if box.ends == NO_ONE_REST and math.isinf(found.upper):
         lost = _lost_by_poles(problem, whole, "")
-        found = replace(
-            lost,
-            lower=found.lower,
-            certificate=found.certificate,
-            reason=found.reason or NO_ONE_REST,
-            seconds=found.seconds,
-            work=found.work,
-        )
+        if math.isfinite(lost.upper):
+            found = replace(
+                found, upper=lost.upper, frequency=lost.frequency, witness=lost.witness, searched="",
+                reason=found.reason or NO_ONE_REST,
+            )  # fmt: skip
     return replace(found, reason=named.reason(found.reason))
 
 
@@ -543,8 +540,8 @@ def _ask(
 
 
 def _loss_by_poles(problem: Problem, box: Box) -> float:
-    """The first loss along the diagonals of a box, or where it ends."""
-    return min(first_loss(problem, box, box.limit)[0], box.limit)
+    """The first loss along the diagonals of a box; else infinity."""
+    return first_loss(problem, box, box.limit)[0]
 
 
 def _lost_by_poles(problem: Problem, box: Box, why: str) -> Margin:
