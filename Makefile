@@ -5,20 +5,25 @@
 # make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
 # make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
 # make docs     the pages of docs/ to docs/_build: warnings are errors; `make links` asks the addresses they point to
+# make wheel    build/wheel/malta-VERSION-py3-none-any.whl, for `pip install` without a checkout
 # make architecture, make coverage   who imports whom; which lines the tests run
 # make check    what CI runs: lint, format, types, pages, both kinds of tests, some of them as on other processors
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+# malta, and beside it what compares it with papers, found by entry points.
+PAPERS := --editable papers
 # By its path, not by a finder: a script beside a checkout that is called malta imports the package, not that folder.
 EDITABLE := --config-settings editable_mode=compat --editable
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 # Small matrices: threads of the linear algebra only get into each other's way, the more so beside parallel tests.
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
+# Tests start hundreds of commands: each would compile all of malta's modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: design test slow processors times fuzz mutants check lint types notebooks docs links bench figures architecture coverage clean
+.PHONY: design test slow processors times fuzz mutants check lint types notebooks docs links wheel bench figures architecture coverage clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
@@ -35,7 +40,7 @@ slow: $(VENV)/dev
 processors: $(VENV)/dev  # RUNS="Prescott:fast Sandybridge:linear" for some of them
 	PYTHONPATH=tests $(BIN)/python -m processors $(RUNS)
 
-times: $(VENV)/dev  # measures the fast tests, and lists those that take long as slow
+times: $(VENV)/dev  # measures the fast tests, and names those that take long
 	PYTHONPATH=tests $(BIN)/python -m seconds
 
 fuzz: $(VENV)/dev
@@ -83,6 +88,12 @@ docs: $(VENV)/docs
 links: $(VENV)/docs  # needs a network
 	$(BIN)/python -m sphinx -W --keep-going -q -b linkcheck docs docs/_build/links
 
+wheel: $(BIN)/python  # malta as one file, for `pip install` on computers without a checkout; malta-papers beside it
+	rm -rf build/wheel build/lib build/bdist.*
+	$(PIP) --quiet wheel --no-deps --wheel-dir build/wheel . ./papers
+	rm -rf build/lib build/bdist.* papers/build
+	@ls build/wheel/*.whl
+
 bench: $(VENV)/dev  # with PAGE=docs/benchmarks.md it writes that page
 	$(BIN)/python bench/run.py $(if $(PAGE),--page $(PAGE))
 
@@ -95,6 +106,7 @@ figures: $(VENV)/dev  # the pictures of the README, of the theory pages, of note
 	$(BIN)/malta plot design/gains/calibrated.json marginmap --x K_A --y K_B --out design/figures/margin_map.svg
 	$(BIN)/malta simulate design/gains/calibrated.json --scenario stroke --out build
 	$(BIN)/malta motion design/gains/calibrated.json build/calibrated_stroke.npz --out design/figures/stroke.gif
+	$(BIN)/malta motion design/gains/calibrated.json build/calibrated_stroke.npz --dark --out design/figures/stroke_dark.gif
 	$(BIN)/python docs/gallery.py
 
 $(BIN)/python:
@@ -102,17 +114,17 @@ $(BIN)/python:
 	  || { echo "malta needs Python 3.11 or newer; name one with: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
-$(VENV)/runtime: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet $(EDITABLE) .
+$(VENV)/runtime: $(BIN)/python pyproject.toml papers/pyproject.toml constraints.txt
+	$(PIP) install --quiet $(EDITABLE) . $(PAPERS)
 	touch $@
 
-$(VENV)/dev: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet $(EDITABLE) '.[dev]'
+$(VENV)/dev: $(BIN)/python pyproject.toml papers/pyproject.toml constraints.txt
+	$(PIP) install --quiet $(EDITABLE) '.[dev]' $(PAPERS)
 	touch $@ $(VENV)/runtime $(VENV)/docs
 
-$(VENV)/docs: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet $(EDITABLE) '.[docs]'
+$(VENV)/docs: $(BIN)/python pyproject.toml papers/pyproject.toml constraints.txt
+	$(PIP) install --quiet $(EDITABLE) '.[docs]' $(PAPERS)
 	touch $@ $(VENV)/runtime
 
 clean:
-	rm -rf $(VENV) build docs/_build *.egg-info
+	rm -rf $(VENV) build docs/_build *.egg-info papers/*.egg-info

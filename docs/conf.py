@@ -18,7 +18,8 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx.ext.autodoc",
-    "links",  # these are of _extensions
+    "accessible",  # these are of _extensions
+    "links",
     "llms",
     "mathml",
     "reference",

@@ -1,7 +1,8 @@
 """Pictures of the gallery, the front page of the documentation: python docs/gallery.py [NAME]...
 
 Each card of docs/index.md names a picture and a command: the command is run in a new folder, and what it draws becomes
-docs/gallery/NAME.png for light pages and NAME_dark.png for dark ones. Pages are photographed in headless Chromium;
+docs/gallery/NAME.png for light pages and NAME_dark.png for dark ones, small for the card, and large in full/ for
+docs/pictures.md. Pages are photographed in headless Chromium;
 where there is none their pictures stay.
 """
 
@@ -30,10 +31,13 @@ ROOT = Path(__file__).parents[1]  # shipped files are named as in a checkout
 PAGE = ROOT / "docs" / "index.md"
 FOLDER = ROOT / "docs" / "gallery"
 CARD = re.compile(r"gallery/(\w+)_dark\.png\n.*?^`(malta .*?)`$", re.MULTILINE | re.DOTALL)
-SIZE = (420, 315)  # pixels of a picture, at most twice as wide as high
-COLOURS = 40
+SIZES = {
+    FOLDER: (420, 315),
+    FOLDER / "full": (1000, 750),
+}  # pixels, at most, of a card's picture and of a page's
+COLOURS, MORE_COLOURS = 26, 64  # of small and of large pictures
 SCREEN = (1280, 900)
-DRAWS = 8.0  # s, in which the live page draws its curves
+DRAWS, PROOF = 3.0, 60.0  # s, in which a page draws, and at most until the live page has its proof
 
 
 def cards(page: str) -> dict[str, str]:
@@ -43,7 +47,8 @@ def cards(page: str) -> dict[str, str]:
 
 def draw(names: list[str]) -> Iterator[Path]:
     """Run the commands of the named cards, of all without names, and write their pictures."""
-    FOLDER.mkdir(exist_ok=True)
+    for place in SIZES:
+        place.mkdir(exist_ok=True)
     for name, command in cards(PAGE.read_text(encoding="utf-8")).items():
         if names and name not in names:
             continue
@@ -53,23 +58,39 @@ def draw(names: list[str]) -> Iterator[Path]:
             if picture is None:
                 print(f"{name}{suffix}: no Chromium, the picture stays", file=sys.stderr)
                 continue
-            file = FOLDER / f"{name}{suffix}.png"
-            small = picture.convert("RGB")
-            small = small.crop((0, 0, small.width, min(small.height, int(0.75 * small.width))))
-            small.thumbnail(SIZE, Image.Resampling.LANCZOS)
-            few_colours(small).save(file, optimize=True)
-            yield file
+            whole = picture.convert("RGB")
+            whole = whole.crop((0, 0, whole.width, min(whole.height, int(0.75 * whole.width))))
+            for place, size in SIZES.items():
+                small = whole.copy()
+                small.thumbnail(size, Image.Resampling.LANCZOS)
+                file = place / f"{name}{suffix}.png"
+                few_colours(small, COLOURS if place == FOLDER else MORE_COLOURS).save(file, optimize=True)
+                yield file
 
 
-def few_colours(picture: Image.Image) -> Image.Image:
-    """A picture of its COLOURS most frequent colours, which stay as they are: one of each cube of 16 a side."""
-    rows, counts = np.unique(np.asarray(picture).reshape(-1, 3), axis=0, return_counts=True)
-    rows = rows[np.argsort(-counts, kind="stable")]
-    _, first = np.unique(rows // 16, axis=0, return_index=True)
-    chosen = rows[np.sort(first)[:COLOURS]]
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.resize(chosen, (256, 3)).ravel().tolist())
-    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
+def few_colours(picture: Image.Image, count: int = COLOURS) -> Image.Image:
+    """A picture of `count` of its own colours: the most frequent one, then each time the one that is missed most.
+
+    A colour is missed by its distance from those that are chosen, and by how often it stands in the picture.
+    """
+    pixels = np.asarray(picture).reshape(-1, 3)
+    rows, which, counts = np.unique(pixels, axis=0, return_inverse=True, return_counts=True)
+    colours, often = rows.astype(float), np.sqrt(counts)
+    chosen, far, nearest = (
+        [int(counts.argmax())],
+        np.full(len(rows), np.inf),
+        np.zeros(len(rows), dtype=np.uint8),
+    )
+    while True:
+        away = ((colours - colours[chosen[-1]]) ** 2).sum(axis=1)
+        nearest[away < far] = len(chosen) - 1
+        far = np.minimum(far, away)
+        if len(chosen) == min(count, len(rows)):
+            break
+        chosen.append(int((far * often).argmax()))
+    drawn = Image.fromarray(nearest[which].reshape(picture.height, picture.width), mode="P")
+    drawn.putpalette(rows[chosen].ravel().tolist())
+    return drawn
 
 
 def pictures(name: str, command: str, folder: Path) -> tuple[Image.Image | None, Image.Image | None]:
@@ -86,10 +107,11 @@ def pictures(name: str, command: str, folder: Path) -> tuple[Image.Image | None,
             found = [photograph(address, dark=dark) for dark in (False, True)]
             server.terminate()
         return found[0], found[1]
+    (folder / "design").symlink_to(ROOT / "design")  # pages name files as they are typed
     shell = command.replace("malta ", f"{malta} ")
     subprocess.run(shell, shell=True, check=True, cwd=folder, env=os.environ | places, capture_output=True)
     drawn = sorted(folder.rglob("*.png"))
-    page = next(folder.rglob("*.html"), None)
+    page = max(folder.rglob("*.html"), key=lambda file: file.stat().st_mtime_ns, default=None)
     if page is not None and not drawn:
         found = [photograph(page.as_uri(), dark=dark) for dark in (False, True)]
         return found[0], found[1]
@@ -117,7 +139,12 @@ def photograph(address: str, *, dark: bool) -> Image.Image | None:
         opened.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
         opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
         opened.get(address)
-        time.sleep(DRAWS if address.startswith("http") else 1.0)
+        until = time.monotonic() + PROOF
+        while address.startswith("http") and time.monotonic() < until:
+            time.sleep(1.0)
+            if opened.execute_script("return document.querySelector('.badge.proven') !== null"):
+                break
+        time.sleep(DRAWS)
         return Image.open(io.BytesIO(opened.get_screenshot_as_png()))
     finally:
         opened.quit()

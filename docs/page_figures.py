@@ -333,7 +333,7 @@ def frames() -> Figure:
 
 def current_noise() -> Figure:
     """Rest and commands of two designs under noise of the current sensors; bars are 95 % intervals over seeds."""
-    from malta.machines.tubular.paper.quantities import rests_of_seeds
+    from malta_papers.tubular.quantities import rests_of_seeds
 
     noise = np.array([0.0, 5.0, 10.0, 13.8, 20.0, 50.0])  # mA
     figure, (motion, force) = new_figure(2, height=3.0)
@@ -374,6 +374,12 @@ def cogging_of_two_modules() -> Figure:
     axes.set_ylim(0, 1.35)
     finish(axes, "distance of the modules' middles [mm]", "cogging over twice one module's")
     return figure
+
+
+def block_diagram() -> Figure:
+    """The loop of a shipped design, block by block."""
+    controller = malta.gains.read("design/gains/robust.json")
+    return malta.report.block_diagram(controller, malta.plant_of(controller.parameters))
 
 
 def bode() -> Figure:
@@ -519,6 +525,37 @@ def bending() -> Figure:
     return figure
 
 
+def any_load() -> Figure:
+    """The worst load of 20 N on `robust`: the load, what it does in the simulator, the bound and the clearance."""
+    controller = malta.gains.read(Path(__file__).parents[1] / "design" / "gains" / "robust.json")
+    plant = malta.plant_of(controller.parameters)
+    loop = malta.loop(plant, controller)
+    found = malta.worst_waveform(loop, "F_x", "x1", 20.0)
+    end = found.peak_time + 0.05
+    scenario = malta.Scenario("load", end, malta.references.hold, disturbance=found.load)
+    run = malta.simulate(plant, controller, scenario)
+    t = np.linspace(0.0, end, 2000)
+    figure = Figure(figsize=(7.2, 4.4), layout="constrained")
+    load, motion = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
+    load.step(1e3 * t, found.load(t)[:, 0], where="post", label="the load that does it", **STYLES[0])
+    finish(load, "", "F_x [N]")
+    motion.plot(1e3 * run.t, 1e6 * run.p[:, 0], label="simulated, nonlinear machine", **STYLES[0])
+    motion.plot(
+        1e3 * found.response[0],
+        1e6 * found.response[1],
+        label="linear loop",
+        **STYLES[1] | {"linestyle": "--"},
+    )
+    bound, clearance = 1e6 * (found.value + found.error), 1e6 * vars(plant.parameters)["r_max"]
+    for size, words in ((bound, "bound of any load of 20 N"), (clearance, "clearance")):
+        for sign in (-1, 1):
+            motion.axhline(sign * size, color="0.3", linestyle=":" if size == bound else "-", linewidth=1)
+        motion.annotate(f"{words}, {size:.0f} µm", (0, size), (4, 4), textcoords="offset points", **GREY)
+    motion.set_ylim(-1.25 * clearance, 1.25 * clearance)
+    finish(motion, "time [ms]", "x1 [µm]")
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "value_sets": value_sets,
     "cell": cell,
@@ -531,6 +568,8 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "current_noise": current_noise,
     "cogging": cogging_of_two_modules,
     "bode": bode,
+    "block_diagram": block_diagram,
+    "statechart": partial(malta.report.statechart, wiring=True),
     "positioning": positioning,
     "coils": coils,
     "order": order,
@@ -538,6 +577,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "flexible_unbalance": partial(flexible_rotor, "unbalance"),
     "bending": bending,
     "scheduled": scheduled,
+    "any_load": any_load,
     "flexible_rest": partial(flexible_rotor, "rest"),
 }
 

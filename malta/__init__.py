@@ -38,6 +38,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.measure import measure as measure
     from malta.loops.loop import loop as loop
     from malta.loops.uncertain_models import uncertain as uncertain
+    from malta.margins.safe_loads import safe_load as safe_load, safe_start as safe_start
+    from malta.margins.worst_waveforms import worst_waveform as worst_waveform
     from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
     from malta.model.inspection import inspect as inspect
@@ -97,6 +99,8 @@ _NAMES = {
     "malta.identification.measure": "measure",
     "malta.loops.loop": "loop",
     "malta.loops.uncertain_models": "uncertain",
+    "malta.margins.safe_loads": "safe_load safe_start",
+    "malta.margins.worst_waveforms": "worst_waveform",
     "malta.model.data": "read",
     "malta.model.equilibrium": "trim",
     "malta.model.inspection": "inspect",
@@ -122,6 +126,10 @@ __all__, _load, __dir__ = contents(__name__, _NAMES, _OLD)
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from malta.files import version
+
+        return version()
     if name == "robustness":
         write = "malta.verify(plant, controller, uncertainty, stages=True)"
         warnings.warn(f"malta.{name} goes: write {write}", DeprecationWarning, stacklevel=2)

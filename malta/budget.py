@@ -65,7 +65,7 @@ def in_rounds(
         with count_work(work, seconds) as meter:
             found = ask(meter.end / TICKS, patient)
         best = found if best is None or rank(found) >= rank(best) else best
-        total += meter.work
+        total += meter.done / TICKS
         work = GROWTH * work if budget.work is None else budget.work - total
         left = work if outer is None else min(work, outer.left / TICKS)
         done = rank(best) == math.inf or (patient and not meter.is_used)

@@ -20,7 +20,7 @@ LINES = 10  # of text, the title's included
 COLUMNS = 80
 ROW_LENGTH = 6  # numbers that stand in a row each
 PREFIXES = {-4: "p", -3: "n", -2: "u", -1: "m", 0: "", 1: "k", 2: "M", 3: "G"}
-PREFIXED_UNITS = ("m", "rad", "s", "N", "A", "V", "W", "Hz", "N m")
+PREFIXED_UNITS = ("m", "rad", "s", "N", "A", "V", "W", "Hz", "K", "Pa", "N m")
 
 
 class Curves(NamedTuple):
@@ -138,12 +138,21 @@ def quantity(value: float, unit: str) -> str:
     >>> quantity(13.4e-6, "m"), quantity(0.36, "kg"), quantity(2, "1")
     ('13.4 um', '0.36 kg', '2')
     """
-    prefix = ""
+    shown, power = prefixed_unit(value, unit)
+    return f"{value / 1000.0**power:.3g}" + ("" if unit == "1" else f" {shown}")
+
+
+def prefixed_unit(value: float, unit: str) -> tuple[str, int]:
+    """The unit with a prefix in which a value in SI has one to three digits before its point, and its power of 1000.
+
+    >>> prefixed_unit(13.4e-6, "m"), prefixed_unit(0.36, "kg")
+    (('um', -2), ('kg', 0))
+    """
     if unit in PREFIXED_UNITS and math.isfinite(value) and value:
         power = math.floor((math.log10(abs(value)) + 1e-9) / 3)
         if power in PREFIXES and (unit != "rad" or power < 0):
-            value, prefix = value / 1000.0**power, PREFIXES[power]
-    return f"{value:.3g}" + ("" if unit == "1" else f" {prefix}{unit}")
+            return f"{PREFIXES[power]}{unit}", power
+    return unit, 0
 
 
 def number(value: float, digits: int = 4) -> str:

@@ -14,26 +14,62 @@ Handler = Callable[[int, FrameType | None], Any]
 
 
 @contextmanager
-def watch_interrupts() -> Iterator[list[float]]:
+def watch_interrupts(*kept: type[BaseException]) -> Iterator[list[float]]:
     """Note when Ctrl-C was pressed (s, monotonic), and let it raise as usual; nothing is noted outside the main thread.
 
-    Libraries may drop the KeyboardInterrupt: whoever watches can raise it again.
+    Libraries may drop the KeyboardInterrupt: whoever watches can raise it again. Or they make an error of their own of
+    it, as CasADi does, which says that an argument is of another type: that becomes the KeyboardInterrupt again.
+
+    kept : errors that stand as they are
     """
     pressed: list[float] = []
     handle = _usual_handler()
     if handle is None:
         yield pressed
         return
+    thrown: list[float] = []
 
     def note(number: int, frame: FrameType | None) -> None:
         pressed.append(time.monotonic())
-        handle(number, frame)
+        try:
+            handle(number, frame)
+        except KeyboardInterrupt:
+            thrown.append(pressed[-1])
+            raise
 
     signal.signal(signal.SIGINT, note)
     try:
         yield pressed
+    except kept:
+        raise
+    except Exception as error:
+        if not thrown:
+            raise
+        raise KeyboardInterrupt from error
     finally:
         signal.signal(signal.SIGINT, handle)
+
+
+@contextmanager
+def soften_first_interrupt(end: Callable[[], None]) -> Iterator[None]:
+    """Let the first Ctrl-C call `end`, which asks the work to end by itself, and further ones raise as usual."""
+    handle = _usual_handler()
+    if handle is None:
+        yield
+        return
+    usual, asked = handle, list[int]()
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        if len(asked) > 1:
+            usual(number, frame)
+        end()
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 def press_again() -> None:

@@ -50,8 +50,10 @@ MEANINGS: dict[str, Meaning] = {
     "motion": Meaning("noise at rest", "low", "machine"),
     "command": Meaning("noise at rest", "low", "machine"),
     "load_moves": Meaning("a constant load from outside", "low", "machine"),
+    "load_any": Meaning("a constant load from outside", "low", "machine"),
     "load_settles": Meaning("a constant load from outside", "low", "machine", "s"),
     "compliance": Meaning("a constant load from outside", "low", "machine"),
+    "load_safe": Meaning("a load of any waveform", "high", "machine", bound=at_least),
     "job": Meaning("main job", "low", "machine"),
     "yield": Meaning("campaign", "high", "box", "percent"),
     "runs": Meaning("campaign", "low", "box"),
@@ -119,7 +121,7 @@ class Merit(NamedTuple):
         if math.isnan(self.value):
             return "none"
         if math.isinf(self.value):
-            return "any"
+            return "never" if self.kind == "load_settles" else "any"
         if self.is_frequency:
             return frequency(self.value)
         factor, _ = ROOTS.get(self.unit) or (in_unit(1.0, self.unit), "")

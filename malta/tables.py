@@ -8,7 +8,7 @@ import tomllib
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field as Checked, StrictStr, ValidationError
@@ -146,15 +146,18 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 MAX_MEMBERS = 2000  # members; a gain file has about 60
 ENTRY = b"PK\x01\x02"  # opens the entry of a member in the table of an archive
 SUFFIX = ".npy"
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # how members may be: as of numpy.savez, savez_compressed
 KINDS = "biufcU"  # of arrays: truth values, numbers, text
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def read_npz(data: bytes) -> dict[str, Any]:
+def read_npz(data: bytes, room: int = 0) -> dict[str, Any]:
     """Read the arrays of an .npz archive by name; they are read-only.
 
-    Raises ValueError for damage and for what numpy.savez does not write of such arrays: compressed or encrypted
-    members, two of one name, objects, arrays of another size than their member.
+    room : bytes that all members may have where numpy.savez_compressed packed them; 0: none may be packed
+
+    Raises ValueError for damage and for what numpy does not write of such arrays: encrypted members, two of one name,
+    objects, arrays of another size than their member, or members of more bytes.
 
     >>> buffer = io.BytesIO()
     >>> np.savez(buffer, t=np.array([0.0, 0.5]))
@@ -162,14 +165,14 @@ def read_npz(data: bytes) -> dict[str, Any]:
     [0.0, 0.5]
     """
     try:
-        return _arrays(data)
+        return _arrays(data, room)
     except ValueError:
         raise
     except Exception as error:  # a damaged archive makes zipfile raise nearly anything
         raise ValueError(f"a damaged archive: {str(error)[:120]}") from error
 
 
-def _arrays(data: bytes) -> dict[str, Any]:
+def _arrays(data: bytes, room: int) -> dict[str, Any]:
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise ValueError("no archive: damage, a pickle or a file of another kind")
     if data.count(ENTRY) > MAX_MEMBERS:  # before zipfile makes a record of each
@@ -177,11 +180,11 @@ def _arrays(data: bytes) -> dict[str, Any]:
     arrays: dict[str, Any] = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
-        if sum(member.file_size for member in members) > len(data):
+        if sum(member.file_size for member in members) > max(len(data), room):
             raise ValueError("members that are compressed or overlap, where numpy.savez stores them")
         for member in members:
             name = member.filename.removesuffix(SUFFIX)
-            if member.compress_type != zipfile.ZIP_STORED:
+            if member.compress_type not in PACKED[: 2 if room else 1]:
                 raise ValueError(f"{name} is compressed, where numpy.savez stores it")
             if name in arrays or not member.filename.endswith(SUFFIX):
                 raise ValueError(f"{name} stands twice" if name in arrays else f"{name} is no array")
@@ -192,17 +195,76 @@ def _arrays(data: bytes) -> dict[str, Any]:
 def _array(content: bytes, name: str) -> Any:
     """The array of a member, whose header declares as many bytes as follow it."""
     file = io.BytesIO(content)
-    version = np.lib.format.read_magic(file)
-    if version not in HEADERS:
-        raise ValueError(f"{name} has the version {version} of its format")
-    shape, columns_first, kind = HEADERS[version](file)
+    shape, columns_first, kind = _header(file, name)
     left = len(content) - file.tell()
-    if kind.hasobject:
-        raise ValueError(f"{name} is an array of objects, which allow_pickle=False refuses")
-    if kind.kind not in KINDS or not kind.itemsize:
-        raise ValueError(f"{name} is an array of {kind}")
     # An array of no bytes may have a long side: it must not become a long list of empty ones.
     if math.prod(shape) * kind.itemsize != left or max(shape, default=0) > len(content):
         raise ValueError(f"{name} declares {shape} entries of {kind.itemsize} bytes where {left} follow")
     order: Any = "F" if columns_first else "C"
     return np.ndarray(shape, kind, buffer=content, offset=file.tell(), order=order)
+
+
+def _header(file: Any, name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and kind of an array; the file stands at its numbers then. Raises ValueError for other arrays."""
+    version = np.lib.format.read_magic(file)
+    if version not in HEADERS:
+        raise ValueError(f"{name} has the version {version} of its format")
+    shape, columns_first, kind = HEADERS[version](file)
+    if kind.hasobject:
+        raise ValueError(f"{name} is an array of objects, which allow_pickle=False refuses")
+    if kind.kind not in KINDS or not kind.itemsize:
+        raise ValueError(f"{name} is an array of {kind}")
+    return shape, columns_first, kind
+
+
+class StoredArray(NamedTuple):
+    """Where the numbers of an array stand in an archive that is not packed."""
+
+    offset: int  # bytes from the begin of the file
+    kind: np.dtype[Any]
+    shape: tuple[int, ...]
+    columns_first: bool
+
+
+def locate_arrays(path: Path) -> dict[str, StoredArray] | None:
+    """Where the arrays of a large .npz archive stand in their file, by name; None where some are packed.
+
+    Checks what `read_npz` checks but for the sums of the members' bytes, which are not read. Raises ValueError.
+    """
+    found: dict[str, StoredArray] = {}
+    try:
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            if len(members) > MAX_MEMBERS or any(m.compress_type != zipfile.ZIP_STORED for m in members):
+                return None
+            if sum(member.file_size for member in members) > path.stat().st_size:
+                raise ValueError("members that overlap, where numpy.savez stores them")
+            for member in members:
+                name = member.filename.removesuffix(SUFFIX)
+                if name in found or not member.filename.endswith(SUFFIX):
+                    raise ValueError(f"{name} stands twice" if name in found else f"{name} is no array")
+                found[name] = _locate(file, member, name)
+    except ValueError:
+        raise
+    except Exception as error:  # as read_npz
+        raise ValueError(f"a damaged archive: {str(error)[:120]}") from error
+    return found
+
+
+def _locate(file: Any, member: zipfile.ZipInfo, name: str) -> StoredArray:
+    file.seek(member.header_offset)
+    head = file.read(30)
+    if head[:4] != b"PK\x03\x04":
+        raise ValueError(f"{name} has no header where the archive says")
+    begin = (
+        member.header_offset
+        + 30
+        + int.from_bytes(head[26:28], "little")
+        + int.from_bytes(head[28:30], "little")
+    )
+    file.seek(begin)
+    shape, columns_first, kind = _header(file, name)
+    left = begin + member.file_size - file.tell()
+    if left != kind.itemsize * math.prod(shape):
+        raise ValueError(f"{name} declares {shape} entries of {kind.itemsize} bytes where {left} follow")
+    return StoredArray(file.tell(), kind, shape, columns_first)

@@ -13,6 +13,7 @@ from malta.errors import InputError
 # The units of machine data, as pint reads them. Angle is a dimension of its own: libraries that take a radian as 1
 # accept Hz for rad/s, an error of 2 pi.
 UNITS = """
+pico- = 1e-12 = p-
 nano- = 1e-9 = n-
 micro- = 1e-6 = u- = µ- = μ-
 milli- = 1e-3 = m-
@@ -25,6 +26,7 @@ meter = [length] = m = metre
 second = [time] = s
 ampere = [current] = A
 radian = [angle] = rad
+kelvin = [temperature] = K
 degree = 0.017453292519943295 * radian = deg
 turn = 6.283185307179586 * radian = revolution
 inch = 0.0254 * meter
@@ -40,9 +42,13 @@ henry = volt * second / ampere = H
 farad = ampere * second / volt = F
 weber = volt * second = Wb
 tesla = weber / meter ** 2 = T
+coulomb = ampere * second = C
+pascal = newton / meter ** 2 = Pa
+bar = 1e5 * pascal
+liter = 1e-3 * meter ** 3 = l = litre
 percent = 0.01
 """
-FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
+FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad", "V": "mV", "K": "mK"}  # units of deviations
 
 
 @cache
@@ -73,9 +79,20 @@ def _is_unit(text: str) -> bool:
 
 
 # The symbols that nearly every file has, as UNITS defines them, for which nobody waits for pint: by scales of which the
-# root units of gram, meter, second, ampere and radian are a product, and by the powers of these.
-_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6, "G": 1e9}
-_ROOTS = ("gram", "meter", "second", "ampere", "radian")
+# root units of gram, meter, second, ampere, radian and kelvin are a product, and by the powers of these.
+_PREFIXES = {
+    "p": 1e-12,
+    "n": 1e-9,
+    "u": 1e-6,
+    "µ": 1e-6,
+    "μ": 1e-6,
+    "m": 1e-3,
+    "c": 1e-2,
+    "k": 1e3,
+    "M": 1e6,
+    "G": 1e9,
+}
+_ROOTS = ("gram", "meter", "second", "ampere", "radian", "kelvin")
 _KILO = ((1e3, 1),)
 _Symbol: TypeAlias = tuple[tuple[tuple[float, int], ...], tuple[int, ...]]
 _SYMBOLS: dict[str, _Symbol] = {
@@ -94,6 +111,10 @@ _SYMBOLS: dict[str, _Symbol] = {
     "T": (_KILO, (1, 0, -2, -1)),
     "ohm": (_KILO, (1, 2, -3, -2)),
     "F": (((1e3, -1),), (-1, -2, 4, 2)),
+    "K": ((), (0, 0, 0, 0, 0, 1)),
+    "C": ((), (0, 0, 1, 1)),
+    "Pa": (_KILO, (1, -1, -2)),
+    "l": (((1e-3, 1),), (0, 3)),
 }
 _UNPREFIXED_SYMBOLS: dict[str, _Symbol] = {  # names without a prefix
     "1": ((), ()),
@@ -207,7 +228,12 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
         factor, found_root = _root_units(unit)
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise InputError(where, f"{name}.unit", _quote(unit), expected, units_like(unit, si_unit)) from error
-    si_factor, si_root = _root_units(si_unit)
+    try:
+        si_factor, si_root = _root_units(si_unit)
+    except Exception as error:  # as above, of what a machine's module declares
+        raise InputError(
+            where, name, f"{_quote(si_unit)} as its unit in SI", "a unit that malta knows"
+        ) from error
     if found_root != si_root:
         if "radian" in si_root and found_root == {key: n for key, n in si_root.items() if key != "radian"}:
             turns = re.sub(r"\b[a-zA-Z]*Hz\b", lambda hertz: f"{hertz[0][:-2]}turn/s", unit)
@@ -264,12 +290,12 @@ def si_unit_of(unit: str) -> str:
 
 @cache
 def base_exponents(unit: str) -> Mapping[str, int]:
-    """The exponents of kg, m, s, A and rad in a unit. Raises InputError for an unknown unit.
+    """The exponents of kg, m, s, A, rad and K in a unit. Raises InputError for an unknown unit.
 
     >>> base_exponents("N m")
     {'kg': 1, 'm': 2, 's': -2}
     """
-    symbols = {"gram": "kg", "meter": "m", "second": "s", "ampere": "A", "radian": "rad"}
+    symbols = {"gram": "kg", "meter": "m", "second": "s", "ampere": "A", "radian": "rad", "kelvin": "K"}
     unit_factor(unit, "unit")
     _, root = _root_units("" if unit == "1" else unit)
     powers = {symbols[name]: int(power) for name, power in root.items()}
@@ -283,9 +309,10 @@ def base_exponents(unit: str) -> Mapping[str, int]:
 _OTHER_UNITS = {
     "": "", "1": "", "percent": "share", "%": "share", "g": "kg", "kg": "kg", "deg": "rad", "degree": "rad",
     "turn": "rad", "revolution": "rad", "rpm": "rad_per_s", "min": "s", "minute": "s", "inch": "m", "in": "m",
+    "bar": "Pa", "mbar": "Pa", "l": "m3", "ml": "m3",
 }  # fmt: skip
-_SI = ("m", "s", "A", "rad", "Hz", "N", "J", "W", "V", "ohm", "Ohm", "H", "F", "Wb", "T", "K")
-_PREFIX_LETTERS = "nuµμmckM"
+_SI = ("m", "s", "A", "rad", "Hz", "N", "J", "W", "V", "ohm", "Ohm", "H", "F", "Wb", "T", "K", "C", "Pa")
+_PREFIX_LETTERS = "pnuµμmckM"
 
 
 @cache

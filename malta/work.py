@@ -14,13 +14,16 @@ from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 Answer = TypeVar("Answer")
+P = ParamSpec("P")
 
 
 TICKS = 1e9  # of a unit: sums of whole ticks do not depend on their order
 ENDLESS_TICKS = 1e18  # ticks
+NO_TIME = "no time was left for it"
 MORE_WORK = "may decide it"  # ends the reason of a search that ended with its work or its time
 
 
@@ -29,30 +32,50 @@ class WorkUp(Exception):
 
 
 @dataclass(eq=False)
+class WorkEnd:
+    """When all work of a command ends with what is known, s of time.monotonic(): whoever waits may bring it forward."""
+
+    at: float = math.inf
+
+
+@dataclass(eq=False)
 class Meter:
     """The work of a question so far, in ticks. It changes in place.
 
     end : of the work of the question, which a last look may exceed; limit : of the innermost share of it
-    deadline : of time.monotonic(); stopped : whether the clock ended it; refused : whether a step was too dear
+    deadline : of time.monotonic(); stopped : whether the clock ended it, after so much work, in ticks
+    refused : whether a step was too dear
+    whole : the end of the work that the question is part of
     """
 
     end: float
     deadline: float = math.inf
+    whole: WorkEnd = field(default_factory=WorkEnd)
     limit: float = math.inf
     ticks: int = 0
-    stopped: bool = False
+    stopped_after: int | None = None
     refused: bool = False
     prices: list[float] = field(default_factory=list)  # of steps that were counted before they were done
 
     def charge(self, ticks: int) -> None:
         self.ticks += ticks
-        if not self.stopped and time.monotonic() > self.deadline:
-            self.stopped = True
+        if not self.stopped and time.monotonic() > min(self.deadline, self.whole.at):
+            self.stopped_after = self.ticks
             self.ticks = max(self.ticks, math.ceil(self.end) + 1)
 
     @property
+    def stopped(self) -> bool:
+        return self.stopped_after is not None
+
+    @property
     def work(self) -> float:
+        """The work so far, units; of a question that the clock ended, all that it had."""
         return self.ticks / TICKS
+
+    @property
+    def done(self) -> int:
+        """The work that was done, ticks."""
+        return self.ticks if self.stopped_after is None else self.stopped_after
 
     @property
     def left(self) -> float:
@@ -68,7 +91,7 @@ current_meter: ContextVar[Meter | None] = ContextVar("meter", default=None)
 
 
 @contextmanager
-def count_work(work: float, seconds: float | None = None) -> Iterator[Meter]:
+def count_work(work: float, seconds: float | None = None, whole: WorkEnd | None = None) -> Iterator[Meter]:
     """Count the work of the block from zero, whatever was done before; its sum counts outside.
 
     The block may take what a block around it leaves, of its work and of its time.
@@ -77,14 +100,15 @@ def count_work(work: float, seconds: float | None = None) -> Iterator[Meter]:
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     if outer is not None:
         end, deadline = min(end, max(outer.left, 0.0)), min(deadline, outer.deadline)
-    own = Meter(end, deadline)
+        whole = whole or outer.whole
+    own = Meter(end, deadline, whole or WorkEnd())
     token = current_meter.set(own)
     try:
         yield own
     finally:
         current_meter.reset(token)
         if outer is not None:
-            outer.charge(own.ticks)
+            outer.charge(own.done)
             outer.refused |= own.refused
 
 
@@ -119,7 +143,53 @@ def refuse() -> None:
 def is_stopped() -> bool:
     """Whether the clock ended the question."""
     own = current_meter.get()
+    if own is not None:
+        own.charge(0)
     return own is not None and own.stopped
+
+
+@contextmanager
+def share_time(share: float) -> Iterator[None]:
+    """Within the block the clock ends the question after a share of the time that is left."""
+    own = current_meter.get()
+    left = math.inf if own is None else own.deadline - time.monotonic()
+    with nullcontext() if math.isinf(left) else count_work(math.inf, share * left):
+        yield
+
+
+def cut_error() -> BaseException:
+    """What a result that was cut short is raised as: WorkUp where the clock ended the question, else as by Ctrl-C."""
+    return WorkUp() if is_stopped() else KeyboardInterrupt()
+
+
+def answer_in_time(nothing: Answer) -> Callable[[Callable[P, Answer]], Callable[P, Answer]]:
+    """A function that answers `nothing` where the clock ended the question before, or ends it while it is prepared."""
+
+    def decorate(function: Callable[P, Answer]) -> Callable[P, Answer]:
+        @wraps(function)
+        def answer(*args: P.args, **kwargs: P.kwargs) -> Answer:
+            if is_stopped():
+                return nothing
+            try:
+                return function(*args, **kwargs)
+            except WorkUp:
+                if not is_stopped():
+                    raise
+                return nothing
+
+        return answer
+
+    return decorate
+
+
+@contextmanager
+def without_limit() -> Iterator[None]:
+    """Steps that no answer can do without, as the models that a report is of: neither counted nor ended."""
+    token = current_meter.set(None)
+    try:
+        yield
+    finally:
+        current_meter.reset(token)
 
 
 def is_past(end: float = math.inf, price: float = 0.0) -> bool:
@@ -147,11 +217,8 @@ def spend(price: float) -> None:
 
 def check_clock() -> None:
     """Raise WorkUp where the clock ended the question. Steps that are done once for many questions are not counted."""
-    own = current_meter.get()
-    if own is not None:
-        own.charge(0)
-        if own.stopped:
-            raise WorkUp
+    if is_stopped():
+        raise WorkUp
 
 
 def remember(

@@ -59,3 +59,32 @@ def printed(browser: Any) -> bytes:
     """The PDF that the page prints to."""
     found = browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})
     return base64.b64decode(found["data"])
+
+
+PAPER_WIDTH = 690  # px, of A4 between its margins
+# A block that is broken over columns has several boxes.
+OVERLAPS = """const blocks = [...document.querySelectorAll(arguments[0])].filter((one) => one.getClientRects().length);
+const clashes = [], name = (node) => `${node.tagName} ${node.getAttribute("class") ?? ""}`.trim();
+for (const [k, one] of blocks.entries()) for (const a of one.getClientRects()) {
+  if (a.right > innerWidth + 1) clashes.push(`${name(one)} is ${Math.round(a.right - innerWidth)} px too wide`);
+  for (const other of blocks.slice(k + 1)) for (const b of other.getClientRects()) {
+    if (one.contains(other) || other.contains(one)) continue;
+    const wide = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+    const tall = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+    if (wide > 2 && tall > 2) clashes.push(`${name(one)} over ${name(other)}`);
+  }
+}
+return clashes;"""
+
+
+def printed_overlaps(browser: Any, selector: str) -> list[str]:
+    """Blocks of the page that lie over each other, or beyond its edge, on paper: by their bounding boxes."""
+    screen = {"width": PAPER_WIDTH, "height": 980, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        found: list[str] = browser.execute_script(OVERLAPS, selector)
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    return found

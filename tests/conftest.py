@@ -27,6 +27,7 @@ from malta.cli import main as cli
 from malta.firmware import cost
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.machines.tubular import plant as tubular
+from malta.model import machines
 from malta.model.printed import read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
@@ -72,45 +73,24 @@ def pytest_report_header(config: pytest.Config) -> str | None:
     return None if seed is None else f"cases drawn with --hypothesis-seed={seed}"
 
 
-# Modules whose tests take longest: parallel workers, which take whole modules, begin with them, so that none of them is
-# left alone at the end.
-LONGEST = (
-    *(
-        "chain",
-        "certificate",
-        "compare",
-        "documents",
-        "pages",
-        "notebooks",
-        "report_page",
-        "tune",
-        "many_parameters",
-    ),
-    *(
-        "claims",
-        "identification",
-        "export_cli",
-        "firmware_trials",
-        "firmware_misra",
-        "cli",
-        "experiments",
-        "campaign",
-        "halbach_experiments",
-    ),
-)
-
-
-LISTED = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines())
+UNKNOWN_CASES = pytest.StashKey[
+    set[tuple[str, str]]
+]()  # cases that `slow_for` names of tests that have no such case
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that were measured to take long are `slow` too: see seconds.py. The longest modules come first."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Cases that the mark `slow_for` names are `slow`, and modules that are marked `first` come first."""
+    named, known = set[tuple[str, str]](), set[tuple[str, str]]()
     for item in items:
-        if item.nodeid in LISTED:
-            item.add_marker(pytest.mark.slow)
-            item.add_marker(pytest.mark.listed)
-    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
+        test, _, case = item.nodeid.partition("[")
+        for mark in item.iter_markers("slow_for"):
+            named |= {(test, name) for name in mark.args}
+            known.add((test, case.removesuffix("]")))
+            if case.removesuffix("]") in mark.args:
+                item.add_marker(pytest.mark.slow)
+    config.stash[UNKNOWN_CASES] = named - known
+    items.sort(key=lambda item: item.get_closest_marker("first") is None)
 
 
 class Design(NamedTuple):
@@ -328,6 +308,28 @@ def designs(_answers: Answers) -> dict[str, Design]:
 def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design:
     """Each shipped design in turn."""
     return designs[request.param]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _machines_of_files() -> Iterator[None]:
+    """Each test module leaves machines of files as it found them: others have some of the same name."""
+    named, loaded = dict(machines._files), {name: sys.modules[name] for name in loaded_machines()}
+    yield
+    forget_machines()
+    machines._files.update(named)
+    sys.modules.update(loaded)
+
+
+def loaded_machines() -> list[str]:
+    """The names of modules that come from machines' files."""
+    return [name for name in sys.modules if name.startswith(machines.FILES)]
+
+
+def forget_machines() -> None:
+    """Leave no machine of a file behind."""
+    machines._files.clear()
+    for name in loaded_machines():
+        del sys.modules[name]
 
 
 QUANTITY = re.compile(r"[-+±]*\d[\w.+-]*(?: (?:%|[munk]?(?:m|s|N|A|V|J|Hz|rad|kg|g))(?![\w/]))?")

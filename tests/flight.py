@@ -9,15 +9,25 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 import malta
+from malta.machines.tubular import experiments
+from malta.simulation.experiments import catalogue
+from malta.simulation.experiments.worst_load import WORST_LOAD
 from malta.simulation.layout import fidelities, layout_of, numbers_of, places_of
 from malta.simulation.period import chain, initial_state, period_of
-from malta.simulation.scenario import setup_of, steps_of
+from malta.simulation.scenario import setup_of
+from malta.simulation.steps import steps_of
+from malta_papers.tubular import experiments as printed
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray
     from malta.model.plant import Plant
     from malta.simulation.layout import Fidelity
     from malta.synthesis.controller import Controller
+
+
+# Of MALTA, with those of its paper and of every machine, as a user has them.
+EXPERIMENTS = experiments.EXPERIMENTS | printed.EXPERIMENTS | {WORST_LOAD: catalogue.EXPERIMENTS[WORST_LOAD]}
+CASES = experiments.CASES | printed.CASES | {WORST_LOAD: catalogue.CASES[WORST_LOAD]}
 
 
 def default_of(plant: Plant) -> Fidelity:

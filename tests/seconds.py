@@ -1,4 +1,4 @@
-"""`make times`: measure the processor time of every fast test, and write the list of those that `make test` leaves out.
+"""`make times`: measure the processor time of every fast test, and name those that `make test` should leave out.
 
 A test's own time counts, with that of the processes that it starts, and not that of what fixtures make for many tests.
 """
@@ -8,11 +8,10 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Generator
-from pathlib import Path
+from operator import itemgetter
 
 import pytest
 
-LIST = Path(__file__).parent / "slow.txt"
 LIMIT = 0.3  # s of processor time
 
 
@@ -36,13 +35,13 @@ class Times:
 
 
 def main() -> int:
-    """Run the fast tests and those of the list, and write the list anew where all pass."""
+    """Run the fast tests, and print those that take longer than LIMIT: their place is under `slow` or `slow_for`."""
     times = Times()
-    code = int(pytest.main(["-q", "-m", "not slow or listed"], plugins=[times]))
-    if code == 0:
-        slow = sorted(name for name, spent in times.spent.items() if spent > LIMIT)
-        LIST.write_text("".join(f"{name}\n" for name in slow), encoding="utf-8")
-        print(f"{LIST.name}: {len(slow)} of {len(times.spent)} tests take more than {LIMIT} s")
+    code = int(pytest.main(["-q", "-m", "not slow"], plugins=[times]))
+    long = {name: spent for name, spent in times.spent.items() if spent > LIMIT}
+    for name, spent in sorted(long.items(), key=itemgetter(1), reverse=True):
+        print(f"{spent:6.2f} s  {name}")
+    print(f"{len(long)} of {len(times.spent)} tests take more than {LIMIT} s")
     return code
 
 

@@ -2,7 +2,7 @@
 const wanted = (new URLSearchParams(window.location.search).get("q") || "").toLowerCase();
 var Scorer = {
   score: ([page, title, anchor, , score]) =>
-    score + (/^(howto|theory|tutorial)/.test(page) ? 20 : /^(benchmarks|changelog|contributing|formats)/.test(page) ? -8 : 0)
+    score + (/^(howto|theory|tutorial|install|elsewhere)/.test(page) ? 20 : /^(benchmarks|changelog|contributing|formats)/.test(page) ? -8 : 0)
     + (!anchor && wanted && title.toLowerCase().includes(wanted) ? 10 : 0),
   objNameMatch: 11,
   objPartialMatch: 6,

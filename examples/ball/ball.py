@@ -6,20 +6,22 @@ q points up from the middle, s is the gap there; the controller adds i to the bi
 takes it from the lower one: f = k_i i + k_s q about the middle, and the force command f takes i = f / k_i.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
 from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
+from malta.model.rigid_body import Body, Resultant
 
 
 @dataclass(frozen=True)
 class Parameters:
     """SI; ball.toml says where each comes from."""
 
-    m: float = si("kg", above=0)  # sphere
-    C: float = si("N m^2/A^2", above=0)  # constant of each magnet
+    m: float = si("mass of the sphere [kg]", above=0)
+    C: float = si("magnet constant [N m^2/A^2]", above=0)  # constant of each magnet
     s: float = si("m", above=0)  # gap in the middle
     I_0: float = si("A", above=0)  # bias current
     g: float = si("m/s^2", at_least=0)
@@ -52,9 +54,24 @@ def plant(par: Parameters) -> Plant:
         ),
         contacts=Contacts(("stop",), lambda x: ca.fabs(x[0]) / par.q_max),
         sensors=Sensors(noise=(par.s_y,)),
+        bodies=lambda: bodies(par),
     )
 
 
 def pull(par: Parameters, q: Any, i: Any) -> Any:
     """The pull of both magnets, N, upwards."""
     return par.C * (((par.I_0 + i) / (par.s - q)) ** 2 - ((par.I_0 - i) / (par.s + q)) ** 2)
+
+
+def bodies(par: Parameters) -> tuple[Body, ...]:
+    """The sphere between its magnets, as `malta motion` draws them; nothing is computed of their sizes."""
+    d = (6 * par.m / (math.pi * 7850)) ** (1 / 3)  # m, of steel, 7850 kg/m^3
+    height = 0.75 * d + par.s
+    return (
+        Body("upper magnet", "box", (d, d, d / 2), (0.0, 0.0, height)),
+        Body("lower magnet", "box", (d, d, d / 2), (0.0, 0.0, -height)),
+        Body(
+            "sphere", "sphere", (d, d, d), moves=("", "", "q"),
+            resultants=(Resultant("magnets", ("", "", "f")),),
+        ),
+    )  # fmt: skip

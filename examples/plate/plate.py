@@ -33,13 +33,13 @@ SENSORS = ((1, 0), (-1, 0), (0, 1))  # of the sensors, in a and b
 class Parameters:
     """SI; plate.toml says where each comes from."""
 
-    m: float = si("kg", above=0)  # plate
-    J_x: float = si("kg m^2", above=0)  # about x
-    J_y: float = si("kg m^2", above=0)  # about y
+    m: float = si("mass of the plate [kg]", above=0)
+    J_x: float = si("moment of inertia [kg m^2]", above=0)  # about x
+    J_y: float = si("moment of inertia [kg m^2]", above=0)  # about y
     a: float = si("m", above=0)  # half distance of the coils along x
     b: float = si("m", above=0)  # half distance of the coils along y
-    k_f: float = si("N/A", above=0)  # force constant of each coil
-    k_z: float = si("N/m", at_least=0)  # negative stiffness of the magnets
+    k_f: float = si("force constant [N/A]", above=0)  # force constant of each coil
+    k_z: float = si("magnet stiffness [N/m]", at_least=0)  # negative stiffness of the magnets
     I_max: float = si("A", above=0)  # limit of each current
     T_d: float = si("s", at_least=0, shapes=True)  # from measurement to force
     gap: float = si("m", above=0)  # clearance of each corner, either way

@@ -42,15 +42,15 @@ MU_0 = 4e-7 * math.pi  # V s/(A m)
 class Parameters:
     """Physical parameters, SI; where each comes from is said in rotor.toml."""
 
-    m: float = si("kg", above=0)  # rotor
+    m: float = si("mass of the rotor [kg]", above=0)
     I_p: float = si("kg m^2", above=0)  # about its axis
     I_t: float = si("kg m^2", above=0)  # across, about the centre of gravity
     l_A: float = si("m", above=0)  # centre of gravity to bearing A
     l_B: float = si("m", above=0)
     s_A: float = si("m", above=0)  # centre of gravity to sensor A
     s_B: float = si("m", above=0)
-    k_s: float = si("N/m", above=0)  # negative stiffness of a bearing axis
-    k_i: float = si("N/A", above=0)  # its force per control current
+    k_s: float = si("magnet stiffness [N/m]", above=0)  # negative stiffness of a bearing axis
+    k_i: float = si("force constant [N/A]", above=0)  # its force per control current
     g_0: float = si("m", above=0)  # air gap
     A_g: float = si("m^2", above=0)  # face of a pole
     theta_p: float = si("rad", above=0)  # between the two poles of a magnet

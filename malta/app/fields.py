@@ -86,6 +86,7 @@ def fields_of(files: Files) -> tuple[PageField, ...]:
     law = tuple(_law_fields(files))
     return (
         *(law if files.spec.search else _with_sliders(law, files)),
+        *_asked_fields(files),
         *_sampling_fields(files),
         *_place_fields(files),
         *_machine_fields(files),
@@ -111,12 +112,30 @@ def _law_fields(files: Files) -> Iterator[PageField]:
                         scale = to_si(1.0, variable.unit, si, "", key) / to_si(1.0, unit, si, "", key)
                     low, high = min(value, variable.low * scale), max(value, variable.high * scale)
                 yield PageField(
-                    key, TITLES.get(path, path), name, value, unit, kind, low, high,
+                    key, _title_of(path), name, value, unit, kind, low, high,
                     zero=path.startswith("weights"),
                     tuning="" if variable is None else variable.name,
                     linked=() if variable is None else variable.entries,
                     factor=scale,
                 )  # fmt: skip
+
+
+def _asked_fields(files: Files) -> Iterator[PageField]:
+    """The bounds of [specification] that are one number."""
+    for path, entries in _tables(files.content.get("specification", {}), "specification"):
+        if path.endswith((".load", ".load_slope")):
+            continue
+        for name, entry in (entries or {}).items():
+            value, unit = (entry["value"], entry["unit"]) if isinstance(entry, Mapping) else (entry, "")
+            key = f"{path}.{name}"
+            label = key.removeprefix("specification.").replace(".", " ")
+            yield PageField(key, "Requirements", label, value, unit, "log", value / SPAN, value * SPAN)
+
+
+def _title_of(path: str) -> str:
+    """The title of a table's entries: that of TITLES, "element radial lead" of [structure.elements.radial_lead]."""
+    words = path.removeprefix("structure.elements.").replace("_", " ")
+    return TITLES.get(path, path if words == path else f"Element {words}")
 
 
 def _with_sliders(law: tuple[PageField, ...], files: Files) -> tuple[PageField, ...]:

@@ -1,6 +1,6 @@
 """A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
 
-    X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)
+    X+ = M X + G r + E w,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0), w loads
 
 The loop is `malta.loop`: hold, delay, current loops, late sensors, loads against v0(z) at the
 trim. Forces that saturate, sums of errors that wait, and what changes along the way are left to `simulate`.
@@ -37,7 +37,7 @@ class LinearRun(NamedTuple):
 
 
 def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) -> LinearRun:
-    """Follow the reference of a scenario with the linear loop, which starts at rest on the reference.
+    """Follow the reference of a scenario with the linear loop, which starts at rest on the reference, under its loads.
 
     loop : `malta.loop(machine, controller).sampled`
 
@@ -54,7 +54,10 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
     closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
     n, m = len(loop.Ad), len(c.forces)
     with np.errstate(all="ignore"):  # an unstable loop runs away
-        X = _follow(closed, driven)
+        rest = _at_rest(closed, driven[0])
+        if scenario.disturbance is not None and loop.pushed is not None:
+            driven[:, :n] += np.asarray(scenario.disturbance(t)) @ loop.pushed.T
+        X = _follow(closed, driven, rest)
         p = here + X[:, :n] @ loop.outputs.T
         v = X @ np.hstack([law.D_y @ loop.Cd, law.C])[:m].T + r @ law.D_r[:m].T
     return LinearRun(t, motion.p, p, v)
@@ -63,8 +66,8 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
 BLOCK = 32  # samples that are stepped through at once
 
 
-def _follow(closed: FloatArray, driven: FloatArray) -> FloatArray:
-    """X+ = M X + d from rest, one row a sample.
+def _follow(closed: FloatArray, driven: FloatArray, state: FloatArray) -> FloatArray:
+    """X+ = M X + d from a state, one row a sample.
 
     The states within a block are those from zero, all blocks at once, and what its first state grows to.
     """
@@ -78,7 +81,6 @@ def _follow(closed: FloatArray, driven: FloatArray) -> FloatArray:
         X[:, k] = X[:, k - 1] @ closed.T + d[:, k - 1]
     whole, across = closed @ powers[-1], X[:, -1] @ closed.T + d[:, -1]
     first = np.empty((blocks, n))
-    state = _at_rest(closed, driven[0])
     for k in range(blocks):
         first[k] = state
         state = whole @ state + across[k]

@@ -13,10 +13,11 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from malta.app.files import Edited
-from malta.app.linear_run import linear_run
+from malta.app.linear_run import LinearRun, linear_run
 from malta.arrays import FloatArray
 from malta.bound import at_most
 from malta.errors import CheckError, InputError
@@ -34,21 +35,23 @@ from malta.model.plants import plant_of
 from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
+from malta.simulation.experiments.worst_load import worst_load_cases
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 from malta.synthesis.step_response import StepResponse
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
-# The runs that the page can show: the machine's main job, and a step of each output.
+# The runs that the page can show: the machine's main job, a step of each output, the worst load of the chosen kind.
 
 
-STEP = "step "
+STEP, WORST_RUN = "step ", "worst load"
 
 
 def run_names(plant: Plant, controller: Controller) -> list[str]:
     """The runs by name, the one that the page begins with first: the main job, unless nothing moves in it."""
     job, steps = main_job(plant), [STEP + s.name for s in plant.outputs]
+    steps += [WORST_RUN] if plant.disturbances else []
     if job not in series_of(plant):
         return steps
     scenario = cases_of(job, plant, controller)[0].scenario
@@ -56,12 +59,18 @@ def run_names(plant: Plant, controller: Controller) -> list[str]:
     return [job, *steps] if np.ptp(moves, axis=0).any() else [*steps, job]
 
 
-def planned_run(plant: Plant, controller: Controller, name: str) -> tuple[str, PlannedRun]:
-    """A run by its name, and the name; "": the first. Raises InputError for an unknown one."""
+def planned_run(plant: Plant, controller: Controller, name: str, load: str = "") -> tuple[str, PlannedRun]:
+    """A run by its name, and the name; "": the first. Raises InputError for an unknown one.
+
+    load : the disturbance of a worst load, which its name has then; "": the first
+    """
     known = run_names(plant, controller)
     name = name or known[0]
     if name not in known:
         raise InputError("run", "name", repr(name), "one of " + ", ".join(known))
+    if name == WORST_RUN:
+        (planned,) = worst_load_cases(plant, controller, on=load)
+        return f"{WORST_RUN} {load}".rstrip(), planned
     if name.startswith(STEP):
         return name, step_cases(plant, controller, output=name.removeprefix(STEP), size=0.0, time=0.0)[0]
     return name, cases_of(name, plant, controller)[0]
@@ -70,6 +79,7 @@ def planned_run(plant: Plant, controller: Controller, name: str) -> tuple[str, P
 POINTS = 400  # of a curve over time, at most
 LOAD_POINTS = 240
 DIGITS = 6  # of what is drawn
+FAR_BEYOND_NOISE = 1e3  # of a sensor's noise: an unstable loop is not drawn further
 
 
 @dataclass(frozen=True)
@@ -204,13 +214,27 @@ def crossovers(curves: LoopCurves) -> list[tuple[float, float] | None]:
 
 
 def run_document(problem: PictureSubject, view: View) -> dict[str, Any] | None:
-    """The chosen run on the linear loop; None where the machine has no such run, or it is too long."""
+    """The chosen run on the linear loop; None where there is no such run, as of an unstable loop's worst load, or it is
+    too long."""
     try:
-        name, planned = planned_run(problem.plant, problem.controller, view.run)
+        name, planned = planned_run(problem.plant, problem.controller, view.run, view.load)
         found = linear_run(problem.loop.sampled, problem.controller, planned.scenario)
-    except InputError:
+    except (InputError, CheckError):
         return None
-    return curves(name, found.t, found.reference, found.p, found.v)
+    end = len(found.t) if problem.report.stable else _end_of_run(problem.plant, found)
+    return curves(name, found.t[:end], found.reference[:end], found.p[:end], found.v[:end])
+
+
+def _end_of_run(plant: Plant, found: LinearRun) -> int:
+    """The samples of an unstable loop until an output is as far off as its unit is asked to move, beyond any noise."""
+    units = [s.unit for s in plant.outputs]
+    moved = np.ptp(found.reference, axis=0)
+    asked = np.array([max(moved[k] for k, other in enumerate(units) if other == unit) for unit in units])
+    noise = np.array(ca.DM(plant.sensors.deviations)).ravel()
+    scale = np.maximum(asked, FAR_BEYOND_NOISE * noise)
+    share = np.abs(found.p - found.reference) / np.where(scale > 0, scale, np.inf)
+    off = np.flatnonzero(share.max(axis=1) > 1)
+    return max(int(off[0]), 2) if len(off) else len(share)
 
 
 def curves(name: str, t: FloatArray, reference: FloatArray, p: FloatArray, v: FloatArray) -> dict[str, Any]:
@@ -304,7 +328,8 @@ def map_document(problem: PictureSubject, names: tuple[str, str], lost: float) -
     ]
     boundary = [round_values(line.T) for line in lines.lines(0.0)] if found.growth.min() < 0 else []
     return {
-        "x": found.x, "y": found.y, "units": found.units, "nominal": found.nominal, "half": found.half,
+        "x": found.x, "y": found.y, "words": found.words, "units": found.units,
+        "nominal": found.nominal, "half": found.half,
         "reach": [round_values(values[[0, -1]]) for values in (found.x_values, found.y_values)],
         "unstable": areas, "boundary": boundary, "beside": found.beside_text,
     }  # fmt: skip

@@ -32,12 +32,18 @@ from malta.app.followers import Worker, describe_error
 from malta.app.picture import View, poles_document, run_names, solve
 from malta.app.pull import Handle, Pull, compare_numbers, pull_to
 from malta.errors import InputError, shorten
+from malta.report.page.bodies import machine_svg
+from malta.synthesis.curve_limits import curve_limits
 from malta.synthesis.requirements import base_of, requirements_for
 from malta.synthesis.spec import Spec
 
 PAUSE_BEFORE_PROOF = 0.25  # s, after the last move until its proof begins
 LONGEST_WAIT = 20.0  # s, of a question for news
 KEPT_NEWS = 1000  # news of one version
+
+LOST_TEXT = (
+    "This design was opened in another tab or cell, which has it now. Reload the page to take it back here."
+)
 
 Document = dict[str, Any]
 
@@ -82,6 +88,7 @@ class Session:
         self._workers = {task: Worker(self._tell) for task in ("check", "prove", "map", "search")}
         self._plane: tuple[str, str] | None = None  # of the map that the page shows
         self._message: Callable[[], Document] | None = None  # of the design that the workers follow
+        self._page: object = None  # that opened the design last: others have lost it
 
     # --- the door ---
 
@@ -104,14 +111,23 @@ class Session:
             ask = body.get("ask") if isinstance(body, dict) else None
             if not isinstance(body, dict) or not isinstance(ask, str) or ask not in doors:
                 raise InputError("malta app", "ask", "another document", "one of " + ", ".join(doors))
+            if ask != "open" and self._is_lost(body):
+                return {"lost": LOST_TEXT}
             return doors[ask](body)
         except Exception as error:
             return {"error": shorten(describe_error(error))}
 
     # --- what the page asks ---
 
-    def open(self, _body: Mapping[str, Any]) -> Document:
-        """Describe the design: fields, runs, disturbances, requirements, units."""
+    def _is_lost(self, body: Mapping[str, Any]) -> bool:
+        """Whether another page has opened the design since the one that sent a document."""
+        return "page" in body and body["page"] != self._page
+
+    def open(self, body: Mapping[str, Any]) -> Document:
+        """Describe the design: fields, runs, disturbances, requirements, units. The page has the design from now on."""
+        with self._state:
+            self._page = body.get("page", self._page)
+            self._state.notify_all()
         files, spec = self.files, self.files.spec
         problem = solve(files.apply(Edit()))
         return {
@@ -119,6 +135,7 @@ class Session:
             "summary": spec.summary,
             "machine": spec.plant.name,
             "preset": spec.parameters.preset,
+            "picture": machine_svg(spec.plant),
             "law": spec.kind,
             "file": default_file(self.root, files.path),
             "fields": [asdict(field) for field in files.fields.values()],
@@ -160,7 +177,11 @@ class Session:
             self._answer = number, answer
             self._follow_later(edit, tasks, answer)
             spent = {"wall": time.perf_counter() - began, "cpu": time.thread_time() - cpu}
-            given = {**answer.document, "missing": [*answer.missing], "seconds": spent}
+            asked = {
+                "requirements": requirement_list(answer.problem.spec),
+                "limits": limit_list(answer.problem.spec),
+            }
+            given = {**answer.document, **asked, "missing": [*answer.missing], "seconds": spent}
             return {"number": number, "version": version, **given}
 
     def rest(self, body: Mapping[str, Any]) -> Document:
@@ -286,7 +307,9 @@ class Session:
         if not isinstance(after, int):
             raise InputError("malta app", "after", repr(after), "a whole number")
         with self._state:
-            self._state.wait_for(lambda: self._count > after, LONGEST_WAIT)
+            self._state.wait_for(lambda: self._count > after or self._is_lost(body), LONGEST_WAIT)
+            if self._is_lost(body):
+                return {"lost": LOST_TEXT}
             return {"after": self._count, "news": [item for number, item in self._news if number > after]}
 
     def save(self, body: Mapping[str, Any]) -> Document:
@@ -426,6 +449,20 @@ def requirement_list(spec: Spec) -> list[Document]:
             }
         )
     return rows
+
+
+def limit_list(spec: Spec) -> list[Document]:
+    """The regions that requirements exclude, with the fields of the page that hold their bounds; null: without end."""
+    return [
+        limit._asdict()
+        | {
+            "words": limit.words,
+            "high": limit.high if math.isfinite(limit.high) else None,
+            "asked": spec.specification[limit.entry],
+            "field": "specification." + limit.entry.replace(" ", "."),
+        }
+        for limit in curve_limits(spec)
+    ]
 
 
 def _machine_values(edit: Edit) -> Document:

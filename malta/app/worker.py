@@ -1,4 +1,4 @@
-"""The process that follows a design: its nonlinear run, its requirements, the proof of its margin, searches from it.
+"""The process that follows a design: its nonlinear run, its requirements, its proofs, searches from it.
 
 `python -m malta.app.worker` reads one JSON document a line and answers with lines of its own. A newer document ends the
 work on an older one, at the next step of that work. The process ends with its standard input.
@@ -36,7 +36,7 @@ from malta.app.picture import (
     solve,
 )
 from malta.errors import CheckError, InputError, shorten
-from malta.margins.loop_report import Outcome
+from malta.margins.outcome import Outcome
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof.loss import ray_bound
 from malta.simulation.simulate import simulate
@@ -55,6 +55,7 @@ TRIALS_ALONG_FRONT = 4  # trials for each number, of a point of the front
 PEAKS_ASKED = (1.4, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7)  # of the peak sensitivity of PIDs along the front
 SLACK = 0.005  # of a requirement, beyond which a point of the front misses it
 PRICES = ("command noise", "moved by")  # of a margin, named as figures of the picture: of an LQG, of a PID
+SAFE_TIME = 10.0  # s, of the proofs of loads of any waveform
 POINT_WORK = 20.0  # of the proof of a point of the front
 
 
@@ -222,6 +223,7 @@ def replies(
     """What follows a design, one document after the other: message["task"] is "check", "prove" or "map"."""
     if message["task"] == "prove":
         yield from _proof(problem, newer)
+        yield from _safe_loads(problem)
         return
     if message["task"] == "map":
         x, y, lost = message["plane"]
@@ -230,14 +232,14 @@ def replies(
     if message["margin"] and problem.spec.uncertainty:
         loops, over = travel_loops(problem.plant, problem.controller, tuple(problem.spec.uncertainty))
         yield {"kind": "margin"} | margin_document(ray_bound(loops, problem.spec.uncertainty, over))
-    yield _simulate(problem, View(run=message["run"]))
+    yield _simulate(problem, View(message["run"], message["load"]))
     yield from _requirements(problem, truth)
 
 
 def _simulate(problem: PictureSubject, view: View) -> dict[str, Any]:
     """The chosen run by the nonlinear simulation."""
     try:
-        name, planned = planned_run(problem.plant, problem.controller, view.run)
+        name, planned = planned_run(problem.plant, problem.controller, view.run, view.load)
         run = simulate(problem.plant, problem.controller, planned.scenario)
     except (InputError, CheckError) as error:
         return {"kind": "run", "error": str(error)}
@@ -290,6 +292,18 @@ def _proof(problem: PictureSubject, newer: Newer) -> Iterator[dict[str, Any]]:
         "reason": margin.reason,
         "seconds": margin.seconds,
     }
+
+
+def _safe_loads(problem: PictureSubject) -> Iterator[dict[str, Any]]:
+    """Below which size each load touches nothing and saturates nothing, whatever its waveform, in SAFE_TIME."""
+    if not (problem.loop.stable and problem.plant.disturbances):
+        return
+    from malta.margins.safe_loads import answers  # ball arithmetic, which a page opens without
+
+    with count_work(math.inf, SAFE_TIME):
+        found = [one for one, _ in answers(problem.loop, [s.name for s in problem.plant.disturbances])]
+    texts = {one.disturbance: f"{one.proven.text(3)} {one.unit}" for one in found if one.limit is not None}
+    yield {"kind": "safe", "loads": texts, "ends": {one.disturbance: one.ends for one in found}}
 
 
 def _end_if(newer: Newer) -> Callable[..., None]:

@@ -15,23 +15,23 @@ from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 from zipimport import zipimporter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arguments import describe as describe_value
 from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
 from malta.files import read_file, version
-from malta.firmware.program import Precision
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
 from malta.model.fingerprint import fingerprint
 from malta.model.machines import module_of
 from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
-from malta.model.parts import part_of
+from malta.model.parts import parts_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.simulation.engine.batch import functions_text
@@ -39,7 +39,10 @@ from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of
 from malta.simulation.readings import GAMMA, keys, mix
 from malta.simulation.scenario import Scenario
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
+
+if TYPE_CHECKING:
+    from malta.firmware.program import Precision
 
 # Points of a design in the unit box, any consecutive ones of them without the others.
 #
@@ -83,24 +86,32 @@ def latin_hypercube(seed: int, samples: int, dimensions: int, first: int, count:
     return np.stack(columns, axis=1)
 
 
-def permute(numbers: NDArray[np.uint64], size: int, key: np.uint64) -> NDArray[np.uint64]:
-    """Where a permutation of 0 ... size - 1 takes some of these numbers. The key chooses the permutation."""
+def permute(
+    numbers: NDArray[np.uint64], size: int, key: np.uint64 | NDArray[np.uint64]
+) -> NDArray[np.uint64]:
+    """Where a permutation of 0 ... size - 1 takes some of these numbers.
+
+    key : chooses the permutation: one of all numbers, or one of each
+    """
     a = math.isqrt(size - 1) + 1
     a += a % 2  # rounds of an odd a and an odd b would be even permutations, and make no others
     b = -(-size // a)
     found = _through_network(numbers, np.uint64(a), np.uint64(b), key)
     while (outside := found >= size).any():
-        found[outside] = _through_network(found[outside], np.uint64(a), np.uint64(b), key)
+        own = key[outside] if isinstance(key, np.ndarray) else key
+        found[outside] = _through_network(found[outside], np.uint64(a), np.uint64(b), own)
     return found
 
 
 def _through_network(
-    numbers: NDArray[np.uint64], a: np.uint64, b: np.uint64, key: np.uint64
+    numbers: NDArray[np.uint64], a: np.uint64, b: np.uint64, key: np.uint64 | NDArray[np.uint64]
 ) -> NDArray[np.uint64]:
     right, left = np.divmod(numbers, a)
-    for own in mix(key + np.arange(1, ROUNDS + 1, dtype=np.uint64) * np.uint64(GAMMA)).reshape(-1, 2):
-        left = (left + mix(own[0] + right * np.uint64(GAMMA)) % a) % a
-        right = (right + mix(own[1] + left * np.uint64(GAMMA)) % b) % b
+    steps = np.arange(1, ROUNDS + 1, dtype=np.uint64) * np.uint64(GAMMA)
+    each = mix(np.add.outer(steps, key))
+    for one, other in zip(each[::2], each[1::2], strict=True):
+        left = (left + mix(one + right * np.uint64(GAMMA)) % a) % a
+        right = (right + mix(other + left * np.uint64(GAMMA)) % b) % b
     return np.asarray(left + a * right)
 
 
@@ -159,8 +170,10 @@ def revision_of(plant: Plant, controller: Controller, scenario: Scenario) -> dic
     law : of the functions of a control period as the engine compiles them: machine, controller and digest
     """
     record, model = type(plant.parameters).__module__, module_of(plant.parameters).__name__
-    part = part_of("experiments", plant.name)
-    modules = dict.fromkeys([model, record] if part is None else [model, record, part.__name__])
+    own, printed = parts_of("experiments", plant.name)
+    of_paper = scenario.name in getattr(printed, "EXPERIMENTS", ())
+    parts = [part.__name__ for part in (own, printed if of_paper else None) if part is not None]
+    modules = dict.fromkeys([model, record, *parts])
     return {
         "engine": _engine_sha256(),
         "machine": _sha256(part for name in modules for part in _module_parts(name)),
@@ -269,16 +282,20 @@ class Plan:
     law: Law = "own"
 
     def __post_init__(self) -> None:
-        machine = self.controller.parameters if self.parameters is None else self.parameters
+        machine = (
+            given_law("campaign", self.controller).parameters if self.parameters is None else self.parameters
+        )
         units = units_of(machine)
         order = [name for name in units if name in self.spread]
         errors = [signal.name for signal in plant_of(machine).sensors.errors]
         for name, value in {
             "parameters": machine,
             "options": {"noise": 1.0} | dict(self.options),
-            "spread": {name: float(self.spread[name]) for name in order}
+            "spread": {name: _share("spread", name, self.spread[name]) for name in order}
             | {name: value for name, value in self.spread.items() if name not in units},
-            "sensor_spread": {name: float(v) for name, v in sorted(self.sensor_spread.items())},
+            "sensor_spread": {
+                name: _share("sensor_spread", name, v) for name, v in sorted(self.sensor_spread.items())
+            },
         }.items():
             object.__setattr__(self, name, value)
         _check_counts(self)
@@ -509,3 +526,12 @@ def machines_of(plan: Plan, values: FloatArray) -> Machines:
             changes[name] = changes[twin]
     errors = dict(zip(plan.sensor_spread, values.T[count:], strict=True))
     return Machines(changes, errors, names, readonly(values))
+
+
+def _share(field: str, name: str, value: Any) -> float:
+    """A share or a size. Raises InputError for an interval: a spread counts either way."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        expected = "one number, which counts either way"
+        raise InputError("campaign", f"{field} {name}", describe_value(value), expected) from None

@@ -16,6 +16,7 @@ from malta.arrays import FloatArray, readonly
 from malta.campaigns.plan import Plan, half_width, varied_names
 from malta.campaigns.store import RunBlock, figure_shapes
 from malta.display import Description, display
+from malta.frames import data_frame
 from malta.merits import Merit
 from malta.model.parameters import differences, units_of
 from malta.model.printed import published_value
@@ -74,6 +75,17 @@ class Campaign:
         """Number of runs by the name of their verdict."""
         counts = np.bincount(self.batch.verdict.astype(int), minlength=len(verdicts(self.plan.plant)))
         return {name: int(n) for name, n in zip(verdicts(self.plan.plant), counts, strict=True) if n}
+
+    def to_pandas(self) -> Any:
+        """A row for each run: the values that vary, SI, how it ended, and its figures of merit, NaN where it has none.
+
+        Raises InputError where pandas is not installed.
+        """
+        ends = verdicts(self.plan.plant)
+        varied = dict(zip(self.names, self.values.T, strict=True))
+        figures = {found.merit.identifier: found.values for found in every_figure(self)}
+        columns = varied | {"verdict": [ends[int(k)] for k in self.batch.verdict]} | figures
+        return data_frame(columns, ("run", self.index))
 
     @property
     def rate(self) -> Rate:

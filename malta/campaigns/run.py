@@ -47,6 +47,7 @@ from malta.simulation.experiments.catalogue import main_job, settling_option, si
 from malta.simulation.simulate import EngineOf
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
+from malta.work import is_stopped
 from malta.writing import replace_files
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
@@ -181,7 +182,7 @@ def run_blocks(plan: Plan, place: Path | None, size: int, session: RunExecution,
                 done[first] = new
                 runs += parts[first]
                 report(0)
-                if pressed:
+                if pressed or is_stopped():
                     raise KeyboardInterrupt
     except KeyboardInterrupt:
         if place is not None:  # the last block may be in the folder and not yet in `done`
@@ -320,7 +321,7 @@ def main_campaign(
 def main_plan(controller: Controller, spec: Spec, machines: int = MACHINES, *, settle: bool = True) -> Plan:
     """The plan of `main_campaign`."""
     job = main_job(spec.plant)
-    options = settling_option(job, spec.plant) if settle else {}
+    options = settling_option(job, spec.plant, controller) if settle else {}
     return Plan(controller, job, dict(spec.uncertainty), samples=machines, options=options)
 
 

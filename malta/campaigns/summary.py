@@ -163,6 +163,7 @@ def _buckets(sketch: Sketch) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]
     counts, buckets = counts[used], buckets.ravel()[used]
     magnitudes = np.where(buckets < 0, ~buckets, buckets)
     inner, outer = ((k << (52 - BITS)).view(np.float64) for k in (magnitudes, magnitudes + 1))
+    outer = np.where(magnitudes == 0, 0.0, outer)  # zeros, with numbers below 3e-312
     low, high = np.where(buckets < 0, -outer, inner), np.where(buckets < 0, -inner, outer)
     bounds = sketch.smallest, sketch.largest
     return np.clip(low, *bounds), np.clip(high, *bounds), counts

@@ -6,12 +6,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from malta.cli.identification import read_band
+from malta.cli.excitation import read_band
+from malta.cli.log_options import Reading, add_log_options
 from malta.cli.options import (
     AsJson,
     Changes,
@@ -32,15 +35,21 @@ from malta.files import PICTURES
 from malta.writing import replace_files
 
 if TYPE_CHECKING:
+    from malta.firmware.export import Until
+    from malta.firmware.signals import Target
+    from malta.firmware.xcp_master import XcpMaster
     from malta.identification.commission import Check, Commissioning
+    from malta.identification.log import Log
     from malta.identification.measure import Measurement
     from malta.synthesis.controller import Controller
 
 PLAN = "Plan"  # a panel of the help
 
 
+@add_log_options
 def measure(
     gains: GainFile,
+    reading: Reading,
     logs: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -79,8 +88,16 @@ def measure(
         ),
     ] = None,
     lines: Annotated[int, typer.Option(metavar="N", help="Lines of each input.", rich_help_panel=PLAN)] = 12,
+    response: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A response of an analyser (.csv) in place of logs.")
+    ] = None,
+    of: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="Which one it is, as 'S x1' or 'SP x1/f'. [as its columns say]"),
+    ] = "",
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw it (.png, .svg, .pdf), or write all responses (.csv)."),
     ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
@@ -94,8 +111,15 @@ def measure(
     Example:  malta measure design/gains/robust.json --plan --width 2%
               malta measure design/gains/robust.json log.npz --out measured.png
     """
-    require_suffixes((out, PICTURES))
+    from malta.identification.log_files import read_log
+
+    require_suffixes((out, (*PICTURES, ".csv")))
     controller = read_controller(gains, machine)
+    if response is not None:
+        _require_no(logs or plan or out, "--response beside a log, --plan or --out")
+        _compare(gains, controller, response, of, uncertain, identified, as_json=as_json)
+        return
+    _require_no(of, "--of without --response")
     if plan:
         _require_no(logs, "a log beside --plan")
         sizes = {} if motion is None else read_assignments("--motion", [f"motion={motion}"], {"motion": "m"})
@@ -108,9 +132,14 @@ def measure(
     if not logs:
         raise InputError("malta measure", "LOG", "none", "a log, or --plan")
     with progress_on(f"measuring from {', '.join(map(str, logs))}"):
-        found = _measure(gains, controller, logs, uncertain, identified)
+        read = [read_log(log, **reading) for log in logs]
+        found = _measure(gains, controller, read, uncertain, identified)
     files = []
-    if out is not None:
+    if out is not None and out.suffix == ".csv":
+        from malta.identification.frequency_response import responses_of, write_responses
+
+        files.append(write_responses(responses_of(found), out))
+    elif out is not None:
         from malta.report.figures import measured_figure, save
 
         files.append(save(measured_figure(found), out))
@@ -131,32 +160,65 @@ def _require_no(given: Any, what: str) -> None:
 
 
 def _measure(
-    gains: Path,
-    controller: Controller,
-    logs: list[Path],
-    uncertain: list[str] | None,
-    identified: Path | None,
+    gains: Path, controller: Controller, read: list[Log], uncertain: list[str] | None, identified: Path | None
 ) -> Measurement:
     """The measurement over the gain file's box, or over the intervals of an identified machine."""
+    from malta.identification.measure import measure as measure_loop
+
+    parameters, box = _machine_and_box(gains, controller, uncertain, identified)
+    return measure_loop(controller, *read, parameters=parameters, uncertainty=box)
+
+
+def _machine_and_box(
+    gains: Path, controller: Controller, uncertain: list[str] | None, identified: Path | None
+) -> tuple[Any, dict[str, float]]:
+    """The machine's parameters, None for the gain file's own, and the box: the gain file's, or the intervals."""
     from malta.gains.contents import uncertainty_of
     from malta.gains.encodings import decode
     from malta.identification.data_file import read_identified
-    from malta.identification.log_files import read_log
-    from malta.identification.measure import measure as measure_loop
     from malta.model.plants import plant_of
     from malta.model.printed import published_figures
 
-    read = [read_log(log) for log in logs]
     if identified is None:
         own = uncertainty_of(decode(gains), published_figures(plant_of(controller.parameters).name))
-        box = read_uncertainty(gains, uncertain, controller.parameters) if own or uncertain else {}
-        return measure_loop(controller, *read, uncertainty=box)
+        return None, read_uncertainty(gains, uncertain, controller.parameters) if own or uncertain else {}
     _require_no(uncertain, "--uncertain beside --identified")
     data = read_identified(identified)
     if type(data.parameters) is not type(controller.parameters):
         raise InputError(identified, "machine", "another machine", "that of the gain file")
-    box = {name: data.joint * share for name, share in data.shares.items()}
-    return measure_loop(controller, *read, parameters=data.parameters, uncertainty=box)
+    return data.parameters, {name: data.joint * share for name, share in data.shares.items()}
+
+
+def _compare(
+    gains: Path,
+    controller: Controller,
+    path: Path,
+    of: str,
+    uncertain: list[str] | None,
+    identified: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Compare a response of an analyser with the machine under its law, and say where it misses."""
+    from malta.identification.frequency_response import compare_response, read_response
+    from malta.report.tables.experiments import response_table
+
+    parameters, box = _machine_and_box(gains, controller, uncertain, identified)
+    read = read_response(path, of)
+    found = compare_response(controller, read, of, parameters=parameters, uncertainty=box)
+    if as_json:
+        from malta.cli.documents.others import response_output
+
+        print_document(response_output(gains, path, found))
+    else:
+        console = make_console()
+        console.print(response_table(found))
+        tube = f"{found.machines} machines, sampled" if found.machines > 1 else "the machine"
+        print_text(
+            console, f"{path}: {len(read.w)} frequencies; predicted: {tube}. An analyser's file has no bands"
+        )
+    if found.refusal:
+        raise CheckError(f"{path}: {found.refusal}")
 
 
 def _print_measurement(found: Measurement, files: list[Path]) -> None:
@@ -216,14 +278,28 @@ def _plan(
         console.print(f"malta excite {gains} {rest} --log flown{k or ''}.npz", soft_wrap=True)
 
 
+@add_log_options
 def commission(
     gains: GainFile,
+    reading: Reading,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Logs, journal and page. [build/commission/NAME]")
     ] = None,
     logs: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="A bench's logs, STEP.npz, .csv or .mat, are judged."),
+    ] = None,
+    step: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="This step alone; again for others.")
+    ] = None,
+    skip: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Leave this step out; again for others.")
+    ] = None,
+    wiring: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS:PORT", help="What the C of --wiring --xcp has found, by its XCP slave."
+        ),
     ] = None,
     plan: Annotated[
         bool, typer.Option("--plan", help="List the steps: what each needs, aborts at and writes.")
@@ -256,22 +332,29 @@ def commission(
         steps_of,
     )
     from malta.model.plants import plant_of
-    from malta.report.page.document import binder_page, binder_text
+    from malta.report.page.binder import binder_page, binder_text, step_pictures
 
     controller = read_controller(gains, machine)
+    if wiring is not None:
+        _print_wiring(controller, wiring)
+        return
     plant = plant_of(controller.parameters)
-    steps = steps_of(plant, content_of(gains)[0].uncertainty or {})
+    box = content_of(gains)[0].uncertainty or {}
+    steps = steps_of(plant, box)
     if plan:
-        _print_plan(steps)
+        _print_plan(steps, tries_wiring=plant.second_order)
         return
     folder = out or Path("build", "commission", controller.name)
     done = commission_machine(
         gains, controller, folder,
         truth=plant_of(change_machine(controller.parameters, change)), errors=read_sensor_errors(sensor, plant),
-        logs=logs, steps=steps, seed=seed or 0, progress=lambda name: print_note(f"step {name}"),
+        logs=logs, reading=reading, steps=steps, only=step or (), skip=skip or (), seed=seed or 0,
+        progress=lambda name: print_note(f"step {name}"),
     )  # fmt: skip
     page, text = folder / "binder.html", folder / "binder.txt"
-    replace_files({page: binder_page(done).content, text: binder_text(done).encode()})
+    with progress_on("drawing what was logged"):
+        drawn = binder_page(done, step_pictures(done, controller, box, reading if logs is not None else None))
+    replace_files({page: drawn.content, text: binder_text(done).encode()})
     files = [Path(entry.log) for entry in done.entries if entry.sha256 and logs is None]
     files += [folder / JOURNAL, page, text]
     noise = noise_of_design(done, controller)
@@ -281,21 +364,64 @@ def commission(
     if as_json:
         from malta.cli.documents.others import CommissionOutput
 
-        left = done.steps[len(done.entries) :]
-        print_document(CommissionOutput.of(done, steps=done.entries, left=left, files=files))
+        print_document(CommissionOutput.of(done, steps=done.entries, left=done.left, files=files))
     else:
         _print_commissioning(done, files)
-    if not done.passed:
-        last = done.entries[-1]
+    last = done.failed
+    if last is not None:
         bad = "; ".join(f"{one.name} is {one.found}" for one in last.findings if not one.holds)
         raise CheckError(f"step {last.name} failed: {last.refusal or bad}")
 
 
-def _print_plan(steps: tuple[Check, ...]) -> None:
-    """The checklist, as it stands before the first step."""
+def _print_wiring(controller: Controller, where: str) -> None:
+    """What a supervisor that tries its wiring has found. Raises CheckError for a mistake."""
+    from malta.firmware.wiring_words import wiring_sentences
+    from malta.firmware.xcp_master import xcp_master
+
+    with xcp_master(where) as master:
+        t, found = _read_wiring(controller, where, master)
+    if found["wired"] == 0 or not any(found["shows"]):
+        print_text(make_console(), f"{where}: the wiring was not tried; set wired to 0 and request a start")
+        return
+    said = wiring_sentences(t, found)
+    if said:
+        raise CheckError(f"{where}: " + "; ".join(said))
+    print_text(
+        make_console(), f"{where}: sensors, coils, current sensors and commutation are as the law believes"
+    )
+
+
+def _read_wiring(controller: Controller, where: str, master: XcpMaster) -> tuple[Target, dict[str, Any]]:
+    """What was exported, and what its supervisor has found: down to duty cycles, or else to currents.
+
+    Raises InputError for a slave of another law, and for one that does not try its wiring.
+    """
+    from malta.firmware.ctext import c_name
+    from malta.firmware.export import target_of
+    from malta.firmware.xcp_master import read_wiring
+
+    if master.law != c_name(controller.name):
+        raise InputError(where, "law", master.law, f"{c_name(controller.name)}, that of the gain file")
+    depths: tuple[Until | None, ...] = (None, "currents")
+    for until in depths:
+        t = replace(target_of(controller, master.precision, until), tunable=True, wiring=True)
+        with suppress(InputError):
+            return t, read_wiring(master, t)
+    raise InputError(where, "", "no results of a wiring", "the slave of an export with --wiring")
+
+
+def _print_plan(steps: tuple[Check, ...], *, tries_wiring: bool) -> None:
+    """The checklist, as it stands before the first step, and whether an export can try its wiring."""
     from malta.report.tables.experiments import checklist_table
 
-    make_console().print(checklist_table(steps))
+    console = make_console()
+    console.print(checklist_table(steps))
+    if not tries_wiring:
+        return
+    before = (
+        "Before the first lift-off an export with --wiring tries sensors, coils and commutation at low force;"
+    )
+    print_text(console, f"{before} --wiring ADDRESS:PORT says here what it has found.")
 
 
 def _print_commissioning(done: Commissioning, files: list[Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
@@ -18,9 +19,11 @@ from malta.cli.options import (
     GainFileOrNone,
     MachineFile,
     OwnOptions,
+    WholeTime,
     Yes,
     change_machine,
     find_design,
+    offer,
     print_scenarios,
     read_assignments,
     read_controller,
@@ -43,6 +46,7 @@ from malta.cli.output import (
     progress_bar,
 )
 from malta.errors import InputError
+from malta.work import count_work
 from malta.writing import json_text, replace_files
 
 if TYPE_CHECKING:
@@ -358,7 +362,11 @@ def campaign(
     sampler: Annotated[
         str,
         typer.Option(
-            metavar="WORD", help="[latin-hypercube] or sobol.", show_default=False, rich_help_panel=MACHINE
+            metavar="WORD",
+            autocompletion=offer("latin-hypercube", "sobol"),
+            help="[latin-hypercube] or sobol.",
+            show_default=False,
+            rich_help_panel=MACHINE,
         ),
     ] = "latin-hypercube",
     seed: Annotated[
@@ -387,6 +395,7 @@ def campaign(
         typer.Option(
             "--controller",
             metavar="WORD",
+            autocompletion=offer("own", "c", "c-float"),
             help="own; or c, c-float: the exported C flies.",
             show_default=False,
             rich_help_panel=RUN,
@@ -396,6 +405,7 @@ def campaign(
         str | None,
         typer.Option(
             metavar="WORD",
+            autocompletion=offer("rare", "sensitivity", "tolerances"),
             help="rare (probability), sensitivity (Sobol indices) or tolerances.",
             rich_help_panel=STUDY,
         ),
@@ -426,12 +436,13 @@ def campaign(
         Path | None, typer.Option(metavar="FOLDER", help="Show how far the campaign in a folder is.")
     ] = None,
     yes: Yes = False,
+    time: WholeTime = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
 
     The folder keeps every block of runs: the same command goes on where it was ended. Whatever the yield is, the exit
-    code is 0. A study of the same box takes the place of plain runs.
+    code is 0.
 
     \b
     Example:  malta campaign design/gains/calibrated.json --spread 20%
@@ -461,7 +472,7 @@ def campaign(
     asked = choose_study(study, limit, keep, cluster)
     options = {"noise": 1.0} | read_options(option, scenario, plant)
     if study != "rare":
-        options = settling_option(scenario, plant) | options
+        options = settling_option(scenario, plant, controller) | options
     plan = Plan(
         controller,
         scenario,
@@ -478,16 +489,22 @@ def campaign(
     bounds = RunLimits(published, find_design(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
     if asked is not None:
+        if time is not None:
+            raise InputError("--time", "", f"--study {asked.name}", "one of them: a study ends by itself")
         run_study(asked, Setting(gains, plan, bounds, folder, workers, as_json, yes))
         return
     session = RunExecution(workers, cluster)
-    with campaign_folder(plan, folder, session, gains), progress_bar(scenario, insists=False) as bar:
+    with (
+        count_work(math.inf, time) as meter,
+        campaign_folder(plan, folder, session, gains),
+        progress_bar(scenario, insists=False) as bar,
+    ):
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
         result = summarize(plan, folder, bounds, workers=workers, cluster=cluster, progress=progress)
-    _report(gains, result, worst, as_json=as_json)
+    _report(gains, result, worst, as_json=as_json, pressed=not meter.stopped)
 
 
-def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
+def _report(gains: Path, found: Summary, worst: int, *, as_json: bool, pressed: bool) -> None:
     """Draw and print a campaign and note what went wrong; exit with code 130 after Ctrl-C."""
     from malta.model.plants import plant_of
 
@@ -507,10 +524,10 @@ def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
         print_note(NO_COMPILER)
     if found.interrupted:
         print_note(
-            f"interrupted after {found.runs} of {plan.samples} runs, which {found.folder} keeps; "
-            "the same command goes on"
+            f"{'interrupted' if pressed else 'ended'} after {found.runs} of {plan.samples} runs, which {found.folder} "
+            "keeps; the same command goes on"
         )
-        raise typer.Exit(130)
+        raise typer.Exit(130 if pressed else 0)
 
 
 def draw_figures(found: Summary) -> list[Path]:

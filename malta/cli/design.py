@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import ast
-import keyword
-import re
-import sys
+import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from importlib.metadata import packages_distributions
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -18,32 +15,35 @@ import typer
 from malta.cli.options import (
     AsJson,
     DesignChanges,
+    WholeTime,
     complete_designs,
     design_files,
     gains_folder,
     read_changed_design,
 )
 from malta.cli.output import (
+    end_early,
     interruption,
     make_console,
     print_document,
     print_error,
     print_written,
-    progress_bar,
-    progress_on,
+    require_whole,
+    work_until,
 )
 from malta.errors import CheckError, InputError
-from malta.files import file_exists, shipped_path
+from malta.files import file_exists
+from malta.work import is_stopped, share_time
 from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.cli.documents.campaigns import DesignPart
-    from malta.margins.loop_report import LoopReport, Outcome
+    from malta.margins.loop_report import LoopReport
+    from malta.margins.outcome import Outcome
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
     from malta.synthesis.filter_check import FilterCheck
     from malta.synthesis.spec import Pid, Spec
-    from malta.tuning.search import Effort
     from malta.tuning.tune import TuningResult
 
 
@@ -62,6 +62,7 @@ def design(
         typer.Option(metavar="FOLDER", help="Folder of the gain files. [gains/ beside the design file]"),
     ] = None,
     figures: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the figures.")] = Path("build"),
+    time: WholeTime = None,
     as_json: AsJson = False,
 ) -> None:
     """Design controllers: synthesize, verify, simulate, write gain files.
@@ -69,6 +70,9 @@ def design(
     A law of [structure] is tuned first, unless the file's numbers hold its goals: `malta tune` writes what it finds.
 
     Gain files are replaced only by a design that is stable on the machine and completes its main job, as the stroke.
+
+    At the end of --time, or at Ctrl-C, the design that is being made is shown as far as it is known, and others are
+    named. Its gain files stand as they were.
 
     With --set the gain files have the name of the design and its changes, so that those of the unchanged design stand.
 
@@ -78,17 +82,21 @@ def design(
     """
     designed: list[DesignPart] = []
     sources: dict[Path, Path] = {}  # output file -> the design file of this run that it comes from
-    code = 0
-    chosen = design_files("design", files)
+    code, left, pressed = 0, list[str](), list[float]()  # files whose designs are not whole; when Ctrl-C was
+    chosen, end = design_files("design", files), math.inf if time is None else monotonic() + time
     for n, file in enumerate(chosen):
+        what = f"designing {file}" + (f" ({n + 1} of {len(chosen)})" if len(chosen) > 1 else "")
+        if pressed or (n and monotonic() > end):
+            left.append(str(file))
+            continue
         try:
-            with progress_on(
-                f"designing {file}" + (f" ({n + 1} of {len(chosen)})" if len(chosen) > 1 else "")
-            ) as work:
-                made = _run_design(file, change, out or gains_folder(file), figures, sources, work.note)
+            with work_until(what, None if time is None else end - monotonic()) as work:
+                pressed = work.pressed
+                made = _run_design(file, change, out or gains_folder(file), figures, sources, work.step)
         except (InputError, CheckError) as error:
             code = max(code, print_error(error, file))
             continue
+        left += [] if made.paths else [str(file)]
         if as_json:
             designed.append(_document(made, change or ()))
         else:
@@ -97,6 +105,9 @@ def design(
         from malta.cli.documents.campaigns import DesignOutput
 
         print_document(DesignOutput(designs=designed))
+    if left:
+        whole = f"{len(chosen) - len(left)} of {len(chosen)} designs are whole"
+        end_early(pressed, f"{whole}; gain files stand as they were of {' '.join(left)}")
     raise typer.Exit(code)
 
 
@@ -108,7 +119,7 @@ class Made(NamedTuple):
     margins: LoopReport
     result: Experiment
     observer: FilterCheck | None  # of an LQG
-    paths: Sequence[Path]  # gain files
+    paths: Sequence[Path]  # gain files; none where the main job was cut short
     picture: Path
     unchanged: bool  # the gain files held these numbers already
 
@@ -121,7 +132,7 @@ def _run_design(
     sources: dict[Path, Path],
     note: Callable[[str], None],
 ) -> Made:
-    """Design, verify and simulate the controller of one design file and write its gain files.
+    """Design, verify and simulate the controller of one design file; write its gain files where nothing was cut short.
 
     Raises InputError for a design of a name that `sources` has, CheckError where a check fails; nothing is written
     over a gain file then.
@@ -153,7 +164,8 @@ def _run_design(
 
         observer = check_filter(spec, model, controller)
     note("margins")
-    margins = linear_report(model, controller, spec.uncertainty)
+    with share_time(MARGIN_SHARE):
+        margins = linear_report(model, controller, spec.uncertainty)
     try:
         require_stable(margins, str(file))
     except CheckError as error:
@@ -165,6 +177,8 @@ def _run_design(
     note("figure")
     published = published_beside(spec.machine_file)
     page = report.design_page(spec, model, margins, result, published)
+    if result.cut or is_stopped():
+        return Made(spec.name, page, margins, result, observer, (), picture, unchanged=True)
     contents = {picture: report.encode_figure(report.experiment_figure(result, published), picture)}
     unchanged = gains.agrees(controller, margins, *paths)
     if not unchanged:
@@ -182,7 +196,7 @@ def _document(made: Made, changes: Sequence[str]) -> DesignPart:
     """The design in the JSON document."""
     from malta.cli.documents.campaigns import ObserverPart, design_part
 
-    files = (*made.paths, made.picture)
+    files = (*made.paths, made.picture) if made.paths else ()
     observer = None if made.observer is None else ObserverPart.of(made.observer)
     return design_part(made.name, files, made.margins, made.result, changes=list(changes), observer=observer)
 
@@ -196,6 +210,8 @@ def _print_design(made: Made) -> None:
         console.print(
             f"Gains by python-control; filterpy's filter agrees to {apart:.0e} ({samples} samples)."
         )
+    if not made.paths:
+        return
     if made.unchanged:
         console.print(f"{made.paths[0]}: holds these numbers already; left as it is", soft_wrap=True)
     print_written(console, (made.picture,) if made.unchanged else (*made.paths, made.picture))
@@ -207,7 +223,7 @@ def _simulate_gain_file(
 ) -> Experiment:
     """Simulate the main job with a gain file that is written for it alone, before a good one is replaced.
 
-    Raises CheckError, naming the design file, when a run ends early; KeyboardInterrupt when Ctrl-C cut it short.
+    Raises CheckError, naming the design file, when a run ends early by itself.
     """
 
     from malta import gains
@@ -222,94 +238,18 @@ def _simulate_gain_file(
         except InputError as error:  # of numbers in the design: the user knows of no other file
             raise InputError(file, error.field, error.found, error.expected) from error
         result = experiment(job, spec.plant, written)
-    if result.cut:
-        raise KeyboardInterrupt
     for case in result.cases:
         end = case.run.verdict
-        if not end.completed:
+        if not (end.completed or end.name == "interrupted"):
             raise CheckError(f"{file}: the {job} ends at {end.time:.4g} s: {end.words}; gain files unchanged")
     return result
 
 
-# `malta new`: a folder with a machine of one's own that runs at once.
-
-
-EXAMPLE = "ball"  # the folder of examples/ that a new machine begins as
-NEXT_STEPS = """
-Try it, from the folder {name}/:
-    malta design
-    malta verify design/gains/{name}.json --machine {name}.py
-    malta simulate design/gains/{name}.json --machine {name}.py --scenario step --out build
-    python notebook.py
-
-Then make it yours:
-    {name}.py           parameters with units, and x' = f(x, u, w), y = h(x, u)
-    {name}.toml         values, each with its unit and where it comes from
-    design/{name}.toml  weights, noise, and how far parameters vary
-    test_{name}.py      numbers that you know by another way
-"""
-
-
-def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the machine: letters, digits and _.")],
-) -> None:
-    """Write a folder NAME with a machine that runs at once, a levitated sphere, and say what to change.
-
-    \b
-    Example:  malta new rotor
-    """
-    from malta.model.machines import machine_names
-
-    folder = Path(name)
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError("malta new", "NAME", repr(name), "small letters, digits and _, as rotor")
-    if name in machine_names():
-        raise InputError(
-            "malta new", "NAME", repr(name), "another name than that of a machine that malta has"
-        )
-    if folder.exists():
-        raise InputError(folder, "", "a file or folder of that name", "a name that is free here")
-    source = shipped_path("examples", EXAMPLE)
-    files = [
-        path for path in sorted(source.rglob("*")) if path.suffix in (".py", ".toml") and _is_source(path)
-    ]
-    if name in _taken_names(files):
-        found = f"{name!r}, which Python, the module or the notebook has for something else"
-        raise InputError("malta new", "NAME", found, "another name")
-    renamed = {
-        folder / path.relative_to(source).with_name(path.name.replace(EXAMPLE, name)): path for path in files
-    }
-    replace_files(
-        {
-            target: re.sub(
-                rf"(?<![A-Za-z]){EXAMPLE}(?![A-Za-z])", name, path.read_text(encoding="utf-8")
-            ).encode()
-            for target, path in renamed.items()
-        }
-    )
-    console = make_console()
-    print_written(console, renamed)
-    console.print(NEXT_STEPS.format(name=name), soft_wrap=True)  # commands stay whole, to be copied
-
-
-def _taken_names(files: Sequence[Path]) -> set[str]:
-    """Names under which a copy of these files would not work: words of Python, modules, and what the files name."""
-    texts = [path.read_text(encoding="utf-8") for path in files if path.suffix == ".py"]
-    trees = [node for text in texts for node in ast.walk(ast.parse(text))]
-    own = {node.id for node in trees if isinstance(node, ast.Name)}
-    own |= {node.arg for node in trees if isinstance(node, ast.arg | ast.keyword) and node.arg}
-    own |= {path.stem for path in files}
-    installed = set(packages_distributions()) | set(sys.stdlib_module_names)
-    return (own | installed | set(keyword.kwlist)) - {EXAMPLE}
-
-
-def _is_source(path: Path) -> bool:
-    return not {"build", "gains", "__pycache__"} & set(
-        path.parts[len(shipped_path("examples", EXAMPLE).parts) :]
-    )
-
-
 # `malta tune`: the numbers of a design for the specification in its file.
+
+
+MARGIN_SHARE = 0.5  # of the time of `malta design`; the rest is for the main job
+SEARCH_SHARE = 0.7  # of the time of `malta tune`; the rest is for the proof and the flights
 
 
 def tune(
@@ -348,6 +288,7 @@ def tune(
     restart: Annotated[
         bool, typer.Option("--restart", help="Forget the trials of an earlier search.")
     ] = False,
+    time: WholeTime = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the numbers of a design for what its file asks for: margin, bandwidth, noise, experiments.
@@ -357,21 +298,22 @@ def tune(
     proven, in a minute and without trials.
 
     The design file that is found is the one that was given, with other numbers. Every trial is kept in the folder: the
-    same command goes on where it was ended. Exit code 1 when something asked for is not reached; the nearest design is
-    written all the same.
+    same command goes on where it was ended, by Ctrl-C or --time, which write the best design by then. Exit code 1 when
+    something asked for is not reached; the nearest design is written all the same.
 
     \b
     Example:  malta tune design/robust.toml --out build/tuned
     """
     from malta.synthesis.design_file import read_design
     from malta.tuning.search import Effort
+    from malta.tuning.tune import tune as search
 
     spec = read_design(file)
     if not (spec.specification or spec.recovery):
         expected = "this table: what the design has to reach, as margin = 3"
         raise InputError(file, "specification", "nothing", expected)
     if check:
-        _judge(spec, file, as_json=as_json)
+        _judge(spec, file, time, as_json=as_json)
         return
     target, journal = out / f"{spec.name}.toml", out / f"{spec.name}_trials.jsonl"
     if target.resolve() == spec.path.resolve() and not overwrite:
@@ -379,10 +321,13 @@ def tune(
     if file_exists(target) and not overwrite:
         raise InputError(target, "", "a design file", "another --out, or --overwrite")
     if spec.structure is not None:
-        _tune_structure(spec, target, as_json=as_json)
+        _tune_structure(spec, target, time, as_json=as_json)
         return
     effort = Effort(generations=generations, front=front)
-    tuned = _search(spec, journal, effort, restart=restart)
+    goes_on = f"the same command goes on from {journal}"
+    with work_until(f"tuning {spec.name}", time, goes_on) as work:
+        share = None if time is None else SEARCH_SHARE * time
+        tuned = search(spec, journal, effort=effort, restart=restart, time=share, progress=work.report)
     files = _write(spec, tuned, target)
     if as_json:
         from malta.cli.documents.others import tune_output
@@ -390,20 +335,24 @@ def tune(
         print_document(tune_output(spec, tuned, files))
     else:
         _print_tables(tuned, files)
+    if work.pressed:
+        raise interruption(f"{target} is the best design by then; with --overwrite {goes_on}")
+    _require_judged(spec, tuned.requirements, target)
     _require_all(tuned.requirements, target)
 
 
-def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
+def _tune_structure(spec: Spec, target: Path, time: float | None, *, as_json: bool) -> None:
     """Tune the elements of a law, write the design file that is found, and judge it."""
     from malta import report
     from malta.structured.design import structured_text, tune_design
     from malta.tuning.judging import judge
 
-    with progress_on(f"tuning {spec.name}") as work:
-        found = tune_design(spec, note=work.note)
+    with work_until(f"tuning {spec.name}", time) as work:
+        with share_time(SEARCH_SHARE):
+            found = tune_design(spec, note=work.step)
         replace_files({target: structured_text(found.spec, target).encode()})
-        work.note("requirements")
-        requirements = judge(found.spec)
+        work.step("requirements")
+        requirements = () if is_stopped() else judge(found.spec)
     if as_json:
         from malta.cli.documents.loops import RequirementPart
         from malta.cli.documents.others import TuneOutput
@@ -413,17 +362,21 @@ def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
     else:
         console = make_console()
         console.print(found.tuned.certificate, soft_wrap=True)
-        console.print(report.requirements_table(requirements))
+        if requirements:
+            console.print(report.requirements_table(requirements))
         print_written(console, [target])
+    if work.pressed:
+        raise interruption(f"{target} is the best design by then")
+    _require_judged(spec, requirements, target)
     _require_all(requirements, target)
 
 
-def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
+def _judge(spec: Spec, file: Path, time: float | None, *, as_json: bool) -> None:
     """Print what the design as it stands reaches; raise CheckError when that is not all it is asked for."""
     from malta import report
     from malta.tuning.judging import judge
 
-    with progress_on(f"judging {spec.name}"):
+    with work_until(f"judging {spec.name}", time) as work:
         requirements = judge(spec)
     if as_json:
         from malta.cli.documents.loops import RequirementPart
@@ -433,18 +386,9 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
         print_document(TuneOutput(design=spec.name, requirements=parts))
     else:
         make_console().print(report.requirements_table(requirements))
+    require_whole(work)
+    _require_judged(spec, requirements, file)
     _require_all(requirements, file)
-
-
-def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> TuningResult:
-    """Search the numbers behind a progress bar; Ctrl-C names the journal of the trials and ends with code 130."""
-    from malta.tuning.tune import tune as search
-
-    with progress_bar(f"tuning {spec.name}") as progress:
-        try:
-            return search(spec, journal, effort=effort, restart=restart, progress=progress)
-        except KeyboardInterrupt:
-            raise interruption(f"the same command goes on from {journal}") from None
 
 
 def _write(spec: Spec, tuned: TuningResult, target: Path) -> list[Path]:
@@ -470,8 +414,19 @@ def _print_tables(tuned: TuningResult, files: Sequence[Path]) -> None:
     console = make_console()
     if tuned.front:
         console.print(report.front_table(tuned))
-    console.print(report.requirements_table(tuned.requirements))
+    if tuned.requirements:
+        console.print(report.requirements_table(tuned.requirements))
     print_written(console, files)
+
+
+def _require_judged(spec: Spec, requirements: Sequence[Outcome], file: Path) -> None:
+    """Raise CheckError for entries of the specification that there was no time to judge."""
+    from malta.tuning.outcomes import open_entries
+
+    left = open_entries(spec.specification, requirements)
+    if left:
+        text = f"no time was left to judge {' '.join(left)}; malta tune {file} --check does"
+        raise CheckError(f"{file}: {text}")
 
 
 def _require_all(requirements: Sequence[Outcome], file: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 
 import typer
 
-from malta.cli.options import NUMBER, AsJson, GainFile, MachineFile, read_controller
+from malta.cli.options import NUMBER, AsJson, GainFile, MachineFile, offer, read_controller
 from malta.cli.output import (
     make_console,
     print_document,
@@ -27,14 +27,26 @@ if TYPE_CHECKING:
 
 def export(
     gains: GainFile,
-    to: Annotated[str, typer.Option("--to", metavar="WORD", help="c: a folder of C99; fmu: one file.")] = "c",
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="WORD",
+            autocompletion=offer("c", "fmu"),
+            help="c: a folder of C99; fmu: one file.",
+        ),
+    ] = "c",
     precision: Annotated[
-        str, typer.Option(metavar="WORD", help="Numbers of the C: float or double.")
+        str,
+        typer.Option(
+            metavar="WORD", autocompletion=offer("float", "double"), help="Numbers of the C: float or double."
+        ),
     ] = "double",
     until: Annotated[
         str | None,
         typer.Option(
             metavar="WORD",
+            autocompletion=offer("currents", "duty-cycles"),
             help="How far down the C goes: currents, or duty-cycles. [as far as the machine is modelled]",
         ),
     ] = None,
@@ -42,6 +54,7 @@ def export(
         str | None,
         typer.Option(
             metavar="WORD",
+            autocompletion=offer("controller", "supervised", "machine", "loop"),
             help="What an FMU has: controller, supervised, machine, or loop of controller and machine. [controller]",
         ),
     ] = None,
@@ -82,6 +95,16 @@ def export(
         str | None,
         typer.Option(metavar="QUANTITY", help="C keeps the last samples in a ring with a trigger, as 100ms."),
     ] = None,
+    xcp: Annotated[
+        str | None, typer.Option(metavar="ADDRESS:PORT", help="An XCP slave, as 127.0.0.1:5555.")
+    ] = None,
+    baud: Annotated[
+        int | None, typer.Option(metavar="N", help="Of the XCP slave's serial line. [115200]")
+    ] = None,
+    wiring: Annotated[
+        bool, typer.Option("--wiring", help="The C tries its wiring before it lifts off.")
+    ] = False,
+    fma: Annotated[bool, typer.Option("--fma", help="C of fused multiply-adds: other bits.")] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -96,13 +119,23 @@ def export(
     """
     from malta.firmware.export import export_c
     from malta.firmware.export_fmu import export_fmu
+    from malta.firmware.xcp import read_port
 
     _require_known(to, precision, until, part, fmi, platforms, clock)
-    for option, given in (("--excitation", excitation), ("--log", log)):
+    for option, given in (
+        ("--excitation", excitation),
+        ("--log", log),
+        ("--wiring", wiring),
+        ("--xcp", xcp),
+        ("--fma", fma),
+    ):
         if given and to == "fmu":
             raise InputError(option, "", "an FMU", "--to c")
     hertz = None if clock is None else _quantity("--clock", clock, "Hz", "a frequency, as 168MHz")
     seconds = None if log is None else _quantity("--log", log, "s", "a time, as 100ms")
+    if baud is not None and xcp is None:
+        raise InputError("--baud", "", "no --xcp", "--xcp ADDRESS:PORT beside it")
+    port = None if xcp is None else read_port(xcp, baud)
     controller = read_controller(gains, machine)
     chosen: Any = {"until": until, "tunable": tunable}
     if to == "fmu":
@@ -131,6 +164,9 @@ def export(
                 clock=hertz,
                 excitation=excitation,
                 log=seconds,
+                wiring=wiring,
+                xcp=port,
+                fma=fma,
                 **chosen,
             )
     if as_json:

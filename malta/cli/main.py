@@ -20,18 +20,22 @@ from typer.main import get_command
 
 from malta.cli.bench import commission, measure
 from malta.cli.campaign import campaign
-from malta.cli.design import design, new, tune
+from malta.cli.design import design, tune
+from malta.cli.excitation import excite
 from malta.cli.export import export, pil, schema
-from malta.cli.identification import excite, identify, learn, log, replay
-from malta.cli.inspect import inspect
+from malta.cli.identification import identify
+from malta.cli.inspect import inspect, new
+from malta.cli.loads import loads
+from malta.cli.log_inspection import log, replay
 from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.pages import app as live_page, claims, motion
 from malta.cli.report import compare, plot, report
 from malta.cli.simulate import simulate
+from malta.cli.stroke_learning import learn
 from malta.cli.verify import check, verify
 from malta.errors import CheckError, InputError, shorten
 from malta.files import version
-from malta.interrupts import is_interrupt
+from malta.interrupts import is_interrupt, watch_interrupts
 from malta.writing import noting_files
 
 # The class of all commands: help in panels, and the options of the version before, which say what replaces them.
@@ -174,7 +178,8 @@ class Grouped(TyperGroup):
         """Run a command; Ctrl-C says which files it has written."""
         with noting_files() as written:
             try:
-                return super().invoke(ctx)
+                with watch_interrupts(typer.Exit, typer.Abort):
+                    return super().invoke(ctx)
             except (KeyboardInterrupt, RuntimeError, SystemError) as error:
                 if not is_interrupt(error):
                     raise
@@ -202,7 +207,7 @@ def _first_line(command: Callable[..., None]) -> str:
 
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
-    "Commands": (design, verify, check, simulate, campaign, tune),
+    "Commands": (design, verify, loads, check, simulate, campaign, tune),
     "From the bench": (excite, log, identify, learn, replay, measure, commission),
     "Pages and pictures": (plot, report, compare, motion, live_page, claims),
     "For other programs": (export, pil, schema),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -52,6 +53,7 @@ SCENARIO_FIELDS: Mapping[str, GeneralOption] = {
     "real_pwm": GeneralOption(False, "in phase: duty cycles in steps, dead time of the half-bridges"),
     "delay": GeneralOption(0.0, "samples between measurement and command"),
     "substeps": GeneralOption(0, "Runge-Kutta steps a sample; the error is estimated"),
+    "accuracy": GeneralOption(0.0, "wanted integration error, in m or rad; 1e-9 without it"),
 }
 LENGTHS = {"distance": "m", "rise": "s", "settle": "s"}  # units of options that many machines have
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
@@ -246,14 +248,32 @@ def complete_designs(incomplete: str) -> list[str]:
     return _files(incomplete, Path("design"), DESIGNS)
 
 
+def machine_modules(incomplete: str) -> list[str]:
+    """Modules of machines, and folders below what was typed."""
+    return _files(incomplete or "./", Path(), (".py",))
+
+
+def offer(*words: str) -> Callable[[str], list[str]]:
+    """The completion of an option that takes one of some words."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in words if word.startswith(incomplete)]
+
+    return complete
+
+
 def scenarios(ctx: Any, incomplete: str) -> list[str]:
-    """The scenarios of the machine of the gain file that was typed."""
+    """The scenarios of the machine of the gain file that was typed; one's own has to be named before, by --machine."""
     found: list[str] = []
     with suppress(Exception):
         from malta import gains
+        from malta.model.machines import machine
         from malta.model.plants import plant_of
         from malta.simulation.experiments.catalogue import experiments_of
 
+        named = ctx.params.get("machine") or os.environ.get("MALTA_MACHINE")
+        if named:
+            machine(locate(named))
         plant = plant_of(gains.read(_typed_gains(ctx)).parameters)
         found = [name for name in experiments_of(plant) if name.startswith(incomplete)]
     return found
@@ -268,6 +288,11 @@ def parameters(ctx: Any, incomplete: str) -> list[str]:
         names = decode(_typed_gains(ctx))["plant"]["parameters"]
         found = [f"{name}=" for name in names if name.startswith(incomplete)]
     return found
+
+
+def parameter_names(ctx: Any, incomplete: str) -> list[str]:
+    """The parameters in the gain file that was typed, as `m`."""
+    return [name.removesuffix("=") for name in parameters(ctx, incomplete)]
 
 
 def _typed_gains(ctx: Any) -> Path:
@@ -292,6 +317,21 @@ def _files(incomplete: str, usual: Path, suffixes: tuple[str, ...]) -> list[str]
 
 
 MACHINE = "Machine"  # a panel of a help
+
+
+TIME_HELP = "End after this time with what is known. [none]"
+
+
+def positive_time(seconds: float | None) -> float | None:
+    """The time that a command may take. Raises InputError for one that is not above zero."""
+    if seconds is not None and not 0 < seconds < math.inf:
+        raise InputError("--time", "", f"{seconds:g}", "seconds above 0")
+    return seconds
+
+
+WholeTime = Annotated[
+    float | None, typer.Option("--time", metavar="SECONDS", callback=positive_time, help=TIME_HELP)
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 Changes = Annotated[
     list[str] | None,
@@ -317,6 +357,7 @@ Uncertain = Annotated[
     typer.Option(
         "--uncertain",
         metavar="SHARE|NAME=SHARE",
+        autocompletion=parameters,
         help="How far parameters vary at margin 1, either way: 20% (those of the gain file), m=10%, ... "
         "[the gain file's]",
     ),
@@ -364,6 +405,7 @@ MachineFile = Annotated[
         "--machine",
         metavar="MODULE",
         envvar="MALTA_MACHINE",
+        autocompletion=machine_modules,
         callback=lambda path: None if path is None else locate(path),
         help="Module of a machine of your own, as rotor.py.",
         rich_help_panel=MACHINE,

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from threading import Event, Thread
@@ -18,7 +18,8 @@ import typer
 
 from malta.bound import at_least, at_most
 from malta.errors import CheckError, InputError, shorten
-from malta.interrupts import is_interrupt, press_again, watch_interrupts
+from malta.interrupts import is_interrupt, press_again, soften_first_interrupt, watch_interrupts
+from malta.work import WorkEnd, count_work
 from malta.writing import json_text
 
 if TYPE_CHECKING:
@@ -172,9 +173,10 @@ class WorkProgress:
     """
 
     def __init__(self, what: str, *, insists: bool = True) -> None:
-        self.what, self.share, self.found, self.insists = what, 0.0, "", insists
+        self.what, self.share, self.found, self.doing, self.insists = what, 0.0, "", "", insists
         self.started = time.monotonic()
         self.pressed: list[float] = []  # when Ctrl-C was
+        self.answer = ""  # what is said to Ctrl-C, once; "": nothing before the work has ended
         self.due = self.started + PATIENCE
         self.ended = Event()
 
@@ -192,6 +194,11 @@ class WorkProgress:
         self.found = found
         self.speak()
 
+    def step(self, doing: str) -> None:
+        """Note in words what is being done."""
+        self.doing = doing
+        self.speak()
+
     def speak(self) -> None:
         """Print a line if one is due."""
         now = time.monotonic()
@@ -199,7 +206,12 @@ class WorkProgress:
             return
         spent = now - self.started
         self.due = now + min(LINES, max(INTERVAL, spent / 4))
-        shown = [self.found, f"{100 * self.share:.0f} %" if self.share > 0 else "", duration_text(spent)]
+        shown = [
+            self.doing,
+            self.found,
+            f"{100 * self.share:.0f} %" if self.share > 0 else "",
+            duration_text(spent),
+        ]
         if self.share > 0:
             shown.append(f"about {duration_text(spent * (1 / min(self.share, 1) - 1))} left")
         print_note(f"{self.what}: {', '.join(filter(None, shown))}")
@@ -208,6 +220,9 @@ class WorkProgress:
         """Print lines as they become due, and press Ctrl-C again where it was dropped, until the work has ended."""
         while not self.ended.wait(min(max(self.due - time.monotonic(), 0.05), 0.25)):
             self.speak()
+            if self.pressed and self.answer:
+                print_note(self.answer)
+                self.answer = ""
             if self.insists and self.pressed and time.monotonic() > self.pressed[-1] + INTERRUPT_TIME:
                 press_again()
 
@@ -220,7 +235,8 @@ def progress_on(what: str, *, insists: bool = True) -> Iterator[WorkProgress]:
     """
     work = WorkProgress(what, insists=insists)
     thread = Thread(target=work.attend, daemon=True)
-    with watch_interrupts() as work.pressed, _draw_bar(work) if sys.stderr.isatty() else nullcontext():
+    bar = _draw_bar(work) if sys.stderr.isatty() else nullcontext()
+    with watch_interrupts(typer.Exit) as work.pressed, bar:
         thread.start()
         try:
             yield work
@@ -242,7 +258,7 @@ def _draw_bar(work: WorkProgress) -> Iterator[None]:
 
         def get_renderables(self) -> Iterable[Any]:
             for task in self.tasks:
-                task.description = f"{work.what} {work.found}".rstrip()
+                task.description = " ".join(filter(None, (work.what, work.doing, work.found)))
                 task.total, task.completed = (1.0, work.share) if work.share > 0 else (None, 0)
             return super().get_renderables()
 
@@ -260,19 +276,45 @@ def progress_bar(what: str, *, insists: bool = True) -> Iterator[Callable[[float
 
 
 @contextmanager
-def margin_progress(what: str) -> Iterator[tuple[Callable[[float], None], Callable[[float, float], None]]]:
-    """Say how far the proof of a margin is, and the bounds so far.
+def work_until(
+    what: str, seconds: float | None, stands: str = "nothing was written"
+) -> Iterator[WorkProgress]:
+    """Say how far work is that ends with what it knows, after some seconds or at the first Ctrl-C.
 
-    Yields the functions that take the share done and the bounds. Ctrl-C prints the last bounds and ends with exit
-    code 130.
+    Searches within the block return what they have found by then. A second Ctrl-C prints the last note, as bounds of a
+    margin, else what `stands`, and ends the command at once with exit code 130.
     """
-    with progress_on(what) as work:
+    end = WorkEnd()
+
+    def stop() -> None:
+        end.at = -math.inf
+
+    with (
+        soften_first_interrupt(stop),
+        count_work(math.inf, seconds, end),
+        progress_on(what, insists=False) as work,
+    ):
+        work.answer = "Ctrl-C: ending with what is known; once more ends at once"
         try:
-            yield work.report, work.bound
+            with watch_interrupts(typer.Exit):
+                yield work
         except (KeyboardInterrupt, RuntimeError, SystemError) as error:
             if not is_interrupt(error):
                 raise
-            raise interruption(work.found or "nothing proven") from None
+            raise interruption(work.found or stands) from None
+
+
+def require_whole(work: WorkProgress) -> None:
+    """End a command that has printed what was known by Ctrl-C with exit code 130."""
+    if work.pressed:
+        raise interruption("what is known by then is above")
+
+
+def end_early(pressed: Sequence[float], stands: str) -> None:
+    """Say in one sentence what stands of work that ended early: after Ctrl-C with exit code 130."""
+    if pressed:
+        raise interruption(stands)
+    print_note(f"the time is up; {stands}")
 
 
 def interruption(stands: str) -> typer.Exit:

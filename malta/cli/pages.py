@@ -15,15 +15,24 @@ from malta.cli.options import (
     AsJson,
     GainFile,
     MachineFile,
+    WholeTime,
     complete_designs,
     design_files,
     read_controller,
     scenarios,
 )
-from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
+from malta.cli.output import (
+    end_early,
+    make_console,
+    print_document,
+    print_note,
+    print_written,
+    require_whole,
+    work_until,
+)
 from malta.errors import InputError
 from malta.files import locate, read_file
-from malta.interrupts import watch_interrupts
+from malta.work import is_stopped
 from malta.writing import replace_files
 
 if TYPE_CHECKING:
@@ -138,6 +147,7 @@ def motion(
             help="A page (.html), or an animated picture (.gif) of the first run. [build/RUN_motion.html]",
         ),
     ] = None,
+    dark: Annotated[bool, typer.Option("--dark", help="A .gif for a dark page.")] = False,
     machine: MachineFile = None,
 ) -> None:
     """Show the machine in motion: its bodies in three dimensions, as they move in a run.
@@ -174,7 +184,7 @@ def motion(
             raise InputError(gains, "verification.robust.witness", "none", "a margin with a witness")
         found += [motion_of(case.run, case.label) for case in witness_flights(plant, controller, point)]
     about = f"Design {controller.name}, machine {plant.name}"
-    content = motion_gif(found[0]) if file.suffix == ".gif" else motion_page(found, about).content
+    content = motion_gif(found[0], dark=dark) if file.suffix == ".gif" else motion_page(found, about).content
     replace_files({file: content})
     print_written(make_console(), [file])
 
@@ -204,6 +214,7 @@ def claims(
             help="Compute the tables of a Markdown file anew, each for the designs that its header names.",
         ),
     ] = None,
+    time: WholeTime = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the ledger, a line a claim: what a machine's paper publishes, ours for each design, and a verdict.
@@ -217,17 +228,19 @@ def claims(
     Example:  malta claims design/table2.toml
               malta claims --update docs/claims/tubular.md
     """
+    from malta.model.parts import require_ledger
     from malta.synthesis.design_file import read_design
 
+    require_ledger()
     if update is not None:
-        _update(update, designs or [])
+        _update(update, designs or [], time)
         return
 
     specs = [read_design(file) for file in design_files("claims", designs, reverse=True, or_shipped=True)]
     if not designs:
         specs = [spec for spec in specs if _is_meant(spec)] or specs
-    with progress_bar("claims") as progress:
-        ledgers = compute_ledgers(specs, progress)
+    with work_until("claims", time) as work:
+        ledgers = compute_ledgers(specs, work.report)
     if as_json:
         from malta.cli.documents.others import ClaimsOutput, LedgerPart
 
@@ -239,6 +252,12 @@ def claims(
 
         for one in ledgers:
             make_console().print(report.claims_table(one, why=why))
+    known = {name for one in ledgers for name in one.designs}
+    left = [f"{one.left} claims on {one.machine}" for one in ledgers if one.left]
+    left += [f"all claims of {spec.name}" for spec in specs if spec.name not in known]
+    if left:
+        end_early(work.pressed, f"missing are {', '.join(left)}")
+    require_whole(work)
 
 
 def _is_meant(spec: Spec) -> bool:
@@ -255,7 +274,7 @@ def compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | N
 
 
 def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], None] | None) -> list[Ledger]:
-    """Compute the ledger of each group of designs of one machine. Raises KeyboardInterrupt where Ctrl-C cut it short.
+    """Compute the ledger of each group of designs of one machine, of the designs that there was time for.
 
     A campaign or an experiment that is cut short hands over what it has, of which a paper's figures cannot be made.
     """
@@ -263,41 +282,39 @@ def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], 
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 
-    with watch_interrupts() as pressed:
-        try:
-            found = [
-                ledger(
-                    group, read_published(group[0].machine_file), progress_of_part(progress, n, len(groups))
-                )
-                for n, group in enumerate(groups)
-            ]
-        except Exception:
-            if not pressed:
-                raise
-        if pressed:
-            raise KeyboardInterrupt
-    return found
+    found: list[Ledger] = []
+    for n, group in enumerate(groups):
+        part, published = progress_of_part(progress, n, len(groups)), read_published(group[0].machine_file)
+        if is_stopped():
+            break
+        found.append(ledger(group, published, part))
+    return [one for one in found if one.designs]
 
 
-def _update(file: Path, designs: Sequence[Path]) -> None:
-    """Compute the tables of a Markdown file anew.
+def _update(file: Path, designs: Sequence[Path], time: float | None) -> None:
+    """Compute the tables of a Markdown file anew; where there is no time for one of them the file stands.
 
     Raises InputError for designs beside the file, a table of a design that is not there, and a file without tables.
     """
-    from malta.report.ledger import find_tables, replace_tables
+    from malta.model.parts import require_ledger
     from malta.synthesis.design_file import read_design
 
+    tables = require_ledger()
     if designs:
         raise InputError("--update", "designs", str(designs[0]), "none: the file's tables name theirs")
     text = read_file(file, "Markdown file", lambda path: path.read_text(encoding="utf-8"))
     known = {path.stem: path for path in design_files("claims", None, or_shipped=True)}
     specs = []
-    for place in find_tables(text, str(file)):
+    for place in tables.find_tables(text, str(file)):
         for name in place.designs:
             if name not in known:
                 raise InputError(file, place.machine, repr(name), "one of " + " ".join(sorted(known)))
         specs.append([read_design(known[name]) for name in place.designs])
-    with progress_bar("claims") as progress:
-        ledgers = _compute_each(specs, progress)
-    replace_files({file: replace_tables(text, ledgers, str(file)).encode()})
+    with work_until("claims", time) as work:
+        ledgers = _compute_each(specs, work.report)
+        early = is_stopped()
+    if early:
+        end_early(work.pressed, f"{file} stands as it was")
+        return
+    replace_files({file: tables.replace_tables(text, ledgers, str(file)).encode()})
     print_written(make_console(), [file])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
@@ -19,19 +18,23 @@ from malta.cli.options import (
     GainFile,
     MachineFile,
     Uncertain,
+    WholeTime,
     change_machine,
     find_design,
+    gain_files,
+    offer,
     read_assignments,
     read_controller,
     read_uncertainty,
 )
 from malta.cli.output import (
-    interruption,
     make_console,
     print_document,
     print_note,
     print_written,
     progress_bar,
+    require_whole,
+    work_until,
 )
 from malta.errors import InputError
 from malta.files import locate, require_suffix
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.report.page.analysis import Subject
     from malta.synthesis.controller import Controller
+    from malta.synthesis.curve_limits import CurveLimit
     from malta.synthesis.spec import Spec
 
 CAMPAIGNS = Path("build", "campaigns")  # where `malta campaign` keeps its folders
@@ -67,6 +71,12 @@ def report(
             metavar="FOLDER", help="A campaign of these gains. [those in build/campaigns/ that are of them]"
         ),
     ] = None,
+    log: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="LOG", help="A log of the machine: shown, and S over prediction if it was excited."
+        ),
+    ] = None,
     design: DesignFile = None,
     uncertain: Uncertain = None,
     change: Changes = None,
@@ -74,6 +84,7 @@ def report(
         bool, typer.Option("--no-proof", help="A first look: no proof of the margins of the parameters.")
     ] = False,
     machine: MachineFile = None,
+    time: WholeTime = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a page about a gain file: what it is, margins and where they go, loads, main job, noise, gains.
@@ -85,15 +96,19 @@ def report(
     Example:  malta report design/gains/robust.json --out build/robust.html --pdf
     """
     from malta.gains.writing import require_stable
+    from malta.identification.log_files import read_log
     from malta.report.page.document import SUFFIXES, pdf_of
     from malta.report.page.report import report_work
 
     controller = read_controller(gains, machine)
     page_file = require_suffix(out or Path("build") / f"{controller.name}_report.html", *SUFFIXES)
     subject = read_subject(gains, controller, change, uncertain, design)
-    with unwritten_progress("report") as progress:
+    logs = [read_log(one) for one in log or ()]
+    with work_until("report", time) as work:
         flown = campaigns_of(campaign, controller, subject.spec, changed=bool(change))
-        analysis, page = report_work(subject, proof=not no_proof, campaigns=flown, progress=progress)
+        analysis, page = report_work(
+            subject, proof=not no_proof, campaigns=flown, logs=logs, progress=work.report
+        )
         contents = {page_file: page.content}
         if pdf:
             contents[page_file.with_suffix(".pdf")] = pdf_of(page)
@@ -107,17 +122,8 @@ def report(
         print_written(make_console(), contents)
     for note in analysis.notes:
         print_note(note)
+    require_whole(work)
     require_stable(analysis.report, str(gains))
-
-
-@contextmanager
-def unwritten_progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Say how far work is that writes nothing before its end; Ctrl-C ends it with exit code 130."""
-    with progress_bar(what) as progress:
-        try:
-            yield progress
-        except KeyboardInterrupt:
-            raise interruption("nothing is written") from None
 
 
 def read_subject(
@@ -184,8 +190,9 @@ KINDS = (
     "load",
     "rootlocus",
     "marginmap",
+    "diagram",
 )
-LOCUS, MAP = "rootlocus", "marginmap"
+LOCUS, MAP, DIAGRAM = "rootlocus", "marginmap", "diagram"
 GAIN = "gain"
 SUFFIXES = (".png", ".svg", ".pdf")
 Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
@@ -201,7 +208,10 @@ class NamedFigure(NamedTuple):
 def plot(
     gains: GainFile,
     kinds: Annotated[
-        list[str], typer.Argument(metavar="KIND...", help=f"One or more of: {', '.join(KINDS)}.")
+        list[str],
+        typer.Argument(
+            metavar="KIND...", autocompletion=offer(*KINDS), help=f"One or more of: {', '.join(KINDS)}."
+        ),
     ],
     others: Annotated[
         list[Path] | None,
@@ -211,7 +221,12 @@ def plot(
         list[str] | None, typer.Option(metavar="NAME", help="A channel to draw. Repeatable. [all]")
     ] = None,
     at: Annotated[
-        str, typer.Option(metavar="WORD", help="Where the loop is cut: sensors or forces.")
+        str,
+        typer.Option(
+            metavar="WORD",
+            autocompletion=offer("sensors", "forces"),
+            help="Where the loop is cut: sensors or forces.",
+        ),
     ] = "sensors",
     parameter: Annotated[
         str | None,
@@ -237,6 +252,7 @@ def plot(
         typer.Option(
             "--others",
             metavar="WORD",
+            autocompletion=offer("box", "nominal"),
             help="Margin map: the other parameters are anywhere in the box, or nominal. [box]",
         ),
     ] = None,
@@ -261,7 +277,8 @@ def plot(
     bode, nyquist, nichols: loop gain with margins. sigma: singular values of L, S, T. sensitivity: |S|, |T| with the
     zones of ISO 14839-3. gang: gang of four. pzmap: poles and zeros. step: references. load: 1 N or 1 N m from
     outside, and compliance. rootlocus: poles over the loop gain or a parameter. marginmap: the proven box in the plane
-    of two uncertain parameters, the others anywhere in it, and the boundary of stability by eigenvalues.
+    of two uncertain parameters, the others anywhere in it, and the boundary of stability by eigenvalues. diagram: the
+    loop's own blocks with rates, delays and limits.
 
     The loop is the machine's, sampled. The machine is the one in the file, with the changes given by --set.
 
@@ -275,6 +292,7 @@ def plot(
     )
     machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
     from malta.loops.curves import loop_curves
+    from malta.synthesis.curve_limits import curve_limits
 
     place = cast("Place", at)
     loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
@@ -283,7 +301,12 @@ def plot(
     maps = _maps([gains, *(others or ())], machines, (x, y), beside or "box") if MAP in kinds else ()
     names = [*dict.fromkeys(kinds)]
     shown, note = _distinct(loops, names, place) if channels is None else (channels, "")
-    pictures = _draw(loops, names, shown, place, (*loci, *maps), named=channels is not None)
+    spec = find_design(locate(gains), next(iter(machines.values()))[1], None)
+    curved = [kind for kind in names if kind != DIAGRAM]
+    pictures = _draw(
+        loops, curved, shown, place, (*loci, *maps), named=channels is not None, limits=curve_limits(spec)
+    )
+    pictures += _diagrams(machines) if DIAGRAM in names else []
     files = _save(pictures, out, dark=dark)
     if note:
         print_note(note)
@@ -438,6 +461,16 @@ def _read_span(plant: Plant, parameter: str, span: str | None) -> tuple[float, f
     return low, high
 
 
+def _diagrams(machines: Machines) -> list[NamedFigure]:
+    """The block diagram of each loop."""
+    from malta.report import plots
+
+    return [
+        NamedFigure(f"{name}_{DIAGRAM}", plots.block_diagram(controller, plant))
+        for name, (plant, controller) in machines.items()
+    ]
+
+
 def _draw(
     loops: Mapping[str, LoopCurves],
     kinds: Sequence[str],
@@ -446,10 +479,12 @@ def _draw(
     planes: Sequence[RootLocus | MarginMap],
     *,
     named: bool,
+    limits: Sequence[CurveLimit] = (),
 ) -> list[NamedFigure]:
     """The pictures of all kinds; a root locus and a margin map are drawn of each loop.
 
     named : whether the user named the channels
+    limits : what requirements of the first design exclude
     """
     from malta.margins.margin_map import MarginMap
     from malta.report import plots
@@ -460,14 +495,14 @@ def _draw(
         outputs = [name for name in channels if name in known] or None
     draw: Mapping[str, Callable[[], Any]] = {
         "bode": lambda: plots.bode(loops, channel=channels, at=at),
-        "nyquist": lambda: plots.nyquist(loops, channel=channels, at=at),
+        "nyquist": lambda: plots.nyquist(loops, channel=channels, at=at, limits=limits),
         "nichols": lambda: plots.nichols(loops, channel=channels, at=at),
         "pzmap": lambda: plots.pzmap(loops),
-        "sigma": lambda: plots.sigma(loops, at=at),
-        "sensitivity": lambda: plots.sensitivity_curves(loops, channel=channels, at=at),
+        "sigma": lambda: plots.sigma(loops, at=at, limits=limits),
+        "sensitivity": lambda: plots.sensitivity_curves(loops, channel=channels, at=at, limits=limits),
         "gang": lambda: plots.gang_of_four(loops, channel=outputs),
         "step": lambda: plots.step(loops, channel=outputs),
-        "load": lambda: plots.load_response(loops, channel=outputs if named else None),
+        "load": lambda: plots.load_response(loops, channel=outputs if named else None, limits=limits),
     }
     first = next(iter(loops))
     pictures = []
@@ -512,11 +547,20 @@ def _file_name(name: str) -> str:
 
 def compare(
     gains: Annotated[
-        list[Path], typer.Argument(metavar="GAINS...", help="2 to 8 gain files: .json, .npz or .mat.")
+        list[Path],
+        typer.Argument(
+            metavar="GAINS...", autocompletion=gain_files, help="2 to 8 gain files: .json, .npz or .mat."
+        ),
     ],
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write a page (.html) with the curves over each other."),
+    ] = None,
+    specification: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DESIGN", help="A design file whose requirements judge all. [of the first that has some]"
+        ),
     ] = None,
     uncertain: Uncertain = None,
     change: Changes = None,
@@ -524,26 +568,37 @@ def compare(
         bool, typer.Option("--no-proof", help="Leave out the margins of the parameters, which take longest.")
     ] = False,
     machine: MachineFile = None,
+    time: WholeTime = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare gain files: what differs in the designs, and every figure of merit with the better one marked.
+    """Compare gain files: which is better by one specification and where, what differs, and all figures of merit.
 
-    Machines that differ are compared in what their loops have in common. An unstable loop gives exit code 1.
+    The requirements of one design file judge all designs, each on the machine of its gain file. Machines that differ
+    are compared in what their loops have in common. An unstable loop gives exit code 1.
 
     \b
     Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
     from malta.gains.writing import require_stable
-    from malta.report.page.comparison import compare as compare_subjects, comparison_tables, require_count
+    from malta.report.page.comparison import (
+        compare as compare_subjects,
+        comparison_tables,
+        judging_spec,
+        require_count,
+    )
     from malta.report.page.document import SUFFIXES
+    from malta.synthesis.design_file import read_design
 
     require_count(len(gains))
     page_file = None if out is None else require_suffix(out, *SUFFIXES)
     files = [locate(file) for file in gains]
     subjects = [read_subject(file, read_controller(file, machine), change, uncertain, None) for file in files]
-    flown = [campaigns_of(None, one.controller, one.spec, changed=bool(change)) for one in subjects]
-    with unwritten_progress("compare") as progress:
-        found = compare_subjects(subjects, proof=not no_proof, campaigns=flown, progress=progress)
+    spec = judging_spec(subjects, None if specification is None else read_design(specification))
+    flown = [campaigns_of(None, one.controller, spec or one.spec, changed=bool(change)) for one in subjects]
+    with work_until("compare", time) as work:
+        found = compare_subjects(
+            subjects, proof=not no_proof, spec=spec, campaigns=flown, progress=work.report
+        )
         written = []
         if page_file is not None:
             from malta.report.page.report import comparison_page
@@ -558,5 +613,6 @@ def compare(
         console = make_console()
         console.print(comparison_tables(found, console.width))
         print_written(console, written)
+    require_whole(work)
     for file, design in zip(files, found.designs, strict=True):
         require_stable(design.report, str(file))

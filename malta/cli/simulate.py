@@ -20,6 +20,7 @@ from malta.cli.options import (
     Seed,
     Yes,
     change_machine,
+    offer,
     print_scenarios,
     read_controller,
     read_options,
@@ -126,13 +127,20 @@ def simulate(
     ] = None,
     seed: Seed = None,
     engine: Annotated[
-        str, typer.Option(metavar="WORD", help="auto, compiled or virtual-machine.", rich_help_panel=RUN)
+        str,
+        typer.Option(
+            metavar="WORD",
+            help="auto, compiled or virtual-machine.",
+            autocompletion=offer("auto", "compiled", "virtual-machine"),
+            rich_help_panel=RUN,
+        ),
     ] = "auto",
     law: Annotated[
         str,
         typer.Option(
             "--controller",
             metavar="WORD",
+            autocompletion=offer("own", "c"),
             help="own; or c: the exported C flies, compared with the own law and in float.",
             rich_help_panel=RUN,
         ),
@@ -310,6 +318,7 @@ def _print_tables(
     """Print the outcome of a simulation, its merits and limits, and an estimate of the integration error."""
     from malta import report
     from malta.simulation.simulate import integration_error
+    from malta.simulation.steps import steps_of
 
     result = simulation.experiment
     run, console = result.run, make_console()
@@ -318,9 +327,13 @@ def _print_tables(
     console.print(report.experiment_table(result, published))
     for line in report.limits_text(result):
         print_text(console, line)
+    units = "/".join(dict.fromkeys(signal.unit for signal in run.plant.outputs))
     if estimate:
-        units = "/".join(dict.fromkeys(signal.unit for signal in run.plant.outputs))
         print_text(console, f"integration error, estimated: {integration_error(run):.1g} {units}")
+    if run.scenario.accuracy is not None:
+        count = steps_of(run.plant, run.controller, run.scenario)
+        said = f"integration error below {run.integration_error:.1g} {units}, {count} steps a sample"
+        print_text(console, said)
 
 
 def _conclude(gains: Path, simulation: SimulatedScenario, engine: str) -> None:

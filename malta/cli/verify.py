@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -16,20 +15,23 @@ from malta.cli.options import (
     GainFile,
     MachineFile,
     Uncertain,
+    WholeTime,
     change_machine,
     find_design,
+    offer,
     read_controller,
     read_uncertainty,
 )
 from malta.cli.output import (
     make_console,
-    margin_progress,
     print_document,
     print_line,
     print_note,
     print_text,
     print_written,
     progress_on,
+    require_whole,
+    work_until,
 )
 from malta.errors import CheckError, InputError, shorten
 
@@ -44,6 +46,9 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
 
 
+TRAVEL_SHARE = 0.5  # of the time, for the margin over the travel
+
+
 def verify(
     gains: GainFile,
     change: Changes = None,
@@ -52,13 +57,11 @@ def verify(
         str,
         typer.Option(
             metavar="WORD",
+            autocompletion=offer("pi", "lag"),
             help="Current loops of the last stage: pi (controllers on the windings), or lag (first order).",
         ),
     ] = "pi",
-    time: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="Longest search of a margin, ended by the clock. [none]"),
-    ] = None,
+    time: WholeTime = None,
     no_proof: Annotated[
         bool, typer.Option("--no-proof", help="A first look: no proof of the margins over the travel.")
     ] = False,
@@ -114,25 +117,30 @@ def verify(
     published = published_figures(plant.name)
     box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters)
     certificate = _certificate_of(certificate, renew)
-    _require_options(time, certificate, proof=not no_proof)
+    if certificate is not None and no_proof:
+        raise InputError("--certificate", "", "--no-proof", "one of them")
     spec = find_design(gains, controller, design)
+    refusal: InputError | CheckError | None = None  # that comes after the tables
     try:
-        with margin_progress("margins") as (progress, bounds):
+        with work_until("margins", time) as work:
             found = verify_loop(
                 plant, controller, box, stages=True, spec=spec, current_loops=cast("CurrentLoops", current_loops),
-                proof=not no_proof, worst_case=worst_case, time=time, progress=progress, bounds=bounds,
+                proof=not no_proof, worst_case=worst_case, time=None if time is None else TRAVEL_SHARE * time,
+                progress=work.report, bounds=work.bound,
             )  # fmt: skip
+            if measured is not None and not no_proof:
+                work.step("unmodelled dynamics")
+                found, refusal = _with_unmodelled(found, measured, identified, time)
     except CheckError as error:
         raise CheckError(f"{gains}: {error}") from error
     for note in found.notes:
         print_note(note)
     files: list[Path] = []
-    refusal: InputError | CheckError | None = None
     if certificate is not None:
         try:
             files.append(_write_certificate(certificate, gains, found))
         except (InputError, CheckError) as error:
-            refusal = error  # the tables come first
+            refusal = error
     if out is not None:
         files += _draw(found, out)
     if as_json:
@@ -143,6 +151,7 @@ def verify(
         flown = campaigns_of(None, controller, spec, changed=bool(change or measured))
         _print_tables(gains, found, spec, published, change or (), campaigns=flown)
         print_written(make_console(), files)
+    require_whole(work)
     require_stable(found, str(gains))
     if refusal is not None:
         raise refusal
@@ -162,11 +171,37 @@ def _read_identified(
     data = read_identified(path)
     if type(data.parameters) is not type(controller.parameters):
         raise InputError(path, "machine", "another machine", "that of the gain file")
+    if data.unmodelled is None:
+        print_note(
+            f"{path}: no bound of unmodelled dynamics in it: what its log leaves is no part of the proof; malta "
+            "identify writes one, of a log with an excitation"
+        )
     joint = 100 * data.joint
     print_note(
         f"{path}: margins count in 95 % intervals; all parameters together are within {joint:.0f} % of them"
     )
     return data
+
+
+def _with_unmodelled(
+    found: LoopReport, data: IdentifiedData, path: Path | None, time: float | None
+) -> tuple[LoopReport, CheckError | None]:
+    """The report with the margin that covers what the log left, or why there is none."""
+    from dataclasses import replace
+
+    from malta.identification.unmodelled import margin_with_left
+
+    left, loops = data.unmodelled, found.current_loops
+    if left is None:
+        return found, None
+    longest = None if time is None else (1 - TRAVEL_SHARE) * time
+    try:
+        whole = margin_with_left(
+            found.plant, found.controller, data.shares, left, data.joint, loops, time=longest
+        )
+    except CheckError as error:
+        return found, CheckError(f"{path}: {error}")
+    return replace(found, unmodelled=whole), None
 
 
 def _certificate_of(certificate: Path | None, renew: Path | None) -> Path | None:
@@ -181,14 +216,6 @@ def _certificate_of(certificate: Path | None, renew: Path | None) -> Path | None
     with refused_as_input():
         json_of(renew)
     return renew
-
-
-def _require_options(time: float | None, certificate: Path | None, *, proof: bool) -> None:
-    """Raise InputError for a time that is not positive, or a certificate without a proof."""
-    if time is not None and not 0 < time < math.inf:
-        raise InputError("--time", "", f"{time:g}", "seconds above 0")
-    if certificate is not None and not proof:
-        raise InputError("--certificate", "", "--no-proof", "one of them")
 
 
 def _write_certificate(path: Path, gains: Path, found: LoopReport) -> Path:
@@ -282,7 +309,7 @@ def _box_of(gains: Path, uncertain: list[str] | None, machine: Path | None) -> d
 def _print(file: Path, gains: Path | None, verdict: CertificateVerdict) -> None:
     """Print what is claimed, of what and where, and whether it holds."""
     from malta.report.tables import COLOURS
-    from malta.report.tables.design import claim_share, claim_table, claim_text
+    from malta.report.tables.certificate import claim_share, claim_table, claim_text
 
     console, stated = make_console(), verdict.stated
     print_text(console, f"{claim_text(stated)}\n")

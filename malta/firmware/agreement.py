@@ -31,7 +31,16 @@ def require_same_law(t: Target) -> None:
 
     The readings of a machine near rest at any place are drawn, with sums and a filter that expects the place.
     """
-    t = replace(t, precision="double", fidelity="force", tunable=False, gains=None, excited=False, logged=0.0)
+    t = replace(
+        t,
+        precision="double",
+        fidelity="force",
+        tunable=False,
+        gains=None,
+        excited=False,
+        logged=0.0,
+        xcp=None,
+    )
     own, exported = _law(t), step_function(t)
     reference, ranges, rng = zero_reference(t), reading_ranges(t.believed), np.random.default_rng(0)
     draws = [share * ranges * rng.uniform(-1, 1, len(ranges)) for share in SHARES]

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from malta.arrays import FloatArray
 from malta.files import scratch_folder
 from malta.firmware.ctext import c_name
-from malta.firmware.program import TRUTHS
+from malta.firmware.program import FUSED, TRUTHS
 from malta.firmware.signals import Target
 from malta.firmware.sources import ring_sources, sources
 from malta.firmware.step import programs_of, started_state, step_function, zero_reference
@@ -207,7 +207,8 @@ def rounding_noise(t: Target) -> RoundingNoise:
     c, plant = t.controller, t.believed
     lasts = ROUNDING_SAMPLES * c.sample_time
     fidelity: Any = t.fidelity if t.driven else "force"
-    run = simulate(plant, c, Scenario("hold", lasts, references.hold, noise=1.0, fidelity=fidelity))
+    hold = Scenario("hold", lasts, references.hold, noise=1.0, fidelity=fidelity, substeps=t.steps)
+    run = simulate(plant, c, hold)
     read = readings_of(t, run)
     if t.excited:
         read["excitation"] = np.zeros_like(read["excitation"])
@@ -234,9 +235,11 @@ CLOCK = 667e6  # Hz, of the Cortex-A9 of the paper's Zynq 7000
 SECONDS = 120.0  # a compiler may take at most
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-tree-loop-distribute-patterns")
 STEP = ("step", "sense", "decide", "look_up")  # functions of every sample, with those of their blocks
+FUSED_KIND = "fused multiply-adds"  # that an export has only on demand
 KINDS = {
     "additions": ("ADD", "SUB", "NEG"),
     "multiplications": ("MUL",),
+    FUSED_KIND: FUSED,
     "divisions": ("DIV",),
     "roots": ("SQRT",),
     "comparisons and choices": (*TRUTHS, "FMIN", "FMAX", "FABS", "IF_ELSE_ZERO", "PICK"),
@@ -282,7 +285,8 @@ def operations(t: Target) -> dict[str, int]:
     count: Counter[str] = Counter()
     for name in ("sense", "decide"):
         count.update(o.op for o in programs_of(t)[name].operations)
-    return {kind: sum(count[op] for op in ops) for kind, ops in KINDS.items()}
+    kinds = [kind for kind in KINDS if t.fused or kind != FUSED_KIND]
+    return {kind: sum(count[op] for op in KINDS[kind]) for kind in kinds}
 
 
 def costs(t: Target) -> list[ProcessorCost]:

@@ -20,6 +20,9 @@ _FORMS = {
     "MUL": "{0} * {1}",
     "DIV": "{0} / {1}",
     "NEG": "-{0}",
+    "FMA": "{fma}({0}, {1}, {2})",
+    "FMS": "{fma}({0}, {1}, -{2})",
+    "FNMA": "{fma}(-{0}, {1}, {2})",
     "FABS": "({0} < {zero}) ? -{0} : {0}",
     "SQRT": "{root}({0})",
     "FMIN": "({0} < {1}) ? {0} : {1}",
@@ -114,7 +117,7 @@ def value_text(p: Program, k: int, names: Mapping[int, str], prefix: str, precis
         for i, a in enumerate(operation.operands)
     ]
     form = _FORMS[operation.op]
-    return form.format(*operands, zero=c_number(0.0, precision), root=f"{prefix}_root")
+    return form.format(*operands, zero=c_number(0.0, precision), root=f"{prefix}_root", fma=f"{prefix}_fma")
 
 
 def operand_text(

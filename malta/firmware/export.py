@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from malta.arguments import positive
+from malta.arguments import describe, positive
 from malta.errors import InputError
 from malta.files import file_exists, locate
 from malta.firmware.agreement import require_same_law
@@ -53,9 +53,38 @@ from malta.firmware.sources import (
     template_context,
 )
 from malta.firmware.step import programs_of
-from malta.firmware.supervisor import MONITORS, STATES, TIMES, ReferenceLimits, monitors_of, reference_limits
+from malta.firmware.supervisor import (
+    TIMES,
+    ReferenceLimits,
+    monitor_names,
+    monitors_of,
+    reference_limits,
+    states_of,
+)
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
-from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
+from malta.firmware.vectors import (
+    SAMPLES,
+    Vector,
+    record_vectors,
+    transition_lines,
+    trial_context,
+    watch_lines,
+)
+from malta.firmware.wiring import wiring_table
+from malta.firmware.xcp import (
+    COMMITS,
+    FOUND,
+    INPUTS,
+    OUTPUTS,
+    PARAMETERS,
+    REFERENCE,
+    SUPERVISOR,
+    WIRED,
+    XcpPort,
+    if_data,
+    wiring_results,
+    xcp_sources,
+)
 from malta.gains.file import content_of
 from malta.gains.stable import read_stable
 from malta.model.parameters import box_words
@@ -88,12 +117,13 @@ class MemoryEntry(NamedTuple):
     offset: int  # bytes
     kind: str = "REAL"  # or LONG, ULONG
     table: str = ""  # words for its values
+    area: int = 0  # of an XCP slave's addresses
 
 
 def a2l_text(t: Target, name: str) -> str:
     """The text of <name>.a2l. name : the controller's, as a C identifier"""
     entries = list(_parameters(t, name))
-    measured = [*_outputs(t), *_supervision()]
+    measured = [*_outputs(t), *_supervision(t), *(_xcp_entries(t) if t.xcp else ())]
     known = dict.fromkeys((e.unit, e.factor) for e in (*entries, *measured) if not e.table)
     methods = {key: f"conversion_{k}" for k, key in enumerate(known, 1)}
     return render(
@@ -108,8 +138,9 @@ def a2l_text(t: Target, name: str) -> str:
             ],
             "characteristics": [_show_entry(e, methods) for e in entries],
             "measurements": [_show_entry(e, methods) for e in measured],
-            "states": list(enumerate(STATES)),
-            "monitors": [(-1, "NONE"), *enumerate(MONITORS)],
+            "states": list(enumerate(states_of(t))),
+            **if_data(t),
+            "monitors": [(-1, "NONE"), *enumerate(monitor_names(t))],
         },
     )
 
@@ -117,6 +148,7 @@ def a2l_text(t: Target, name: str) -> str:
 def _show_entry(e: MemoryEntry, methods: dict[tuple[str, float], str]) -> dict[str, Any]:
     return e._asdict() | {
         "meaning": comment(e.meaning).replace('"', "'"),
+        "address": f"0x{(e.area << 16) + e.offset:X}",
         "method": e.table or methods[e.unit, e.factor],
         "low": repr(float(e.low)),
         "high": repr(float(e.high)),
@@ -141,14 +173,16 @@ def _parameters(t: Target, name: str) -> Iterator[MemoryEntry]:
         ranges = np.stack([p.least, p.most]) * factor
         for label, signal, low, high in zip(_labels(p.field), p.field.signals, *ranges, strict=True):
             unit = own or ("" if signal.unit in ("SI", "1") else signal.unit)
-            yield MemoryEntry(label, p.field.meaning, unit, factor, low, high, symbol, at)
+            yield MemoryEntry(label, p.field.meaning, unit, factor, low, high, symbol, at, area=PARAMETERS)
             at += t.real_bytes
     for title, most in zip(monitor_titles(monitors_of(t)), counts_of(t), strict=True):
         words = "samples in a row until a monitor acts"
-        yield MemoryEntry(f"samples.{c_name(title)}", words, "", 1.0, 1, most, symbol, at, "LONG")
+        yield MemoryEntry(
+            f"samples.{c_name(title)}", words, "", 1.0, 1, most, symbol, at, "LONG", area=PARAMETERS
+        )
         at += INT_BYTES
     words = f"FNV-1a, from 0x{FNV_START:08x}, over the bytes of the record before it"
-    yield MemoryEntry("checksum", words, "", 1.0, 0, 2**32 - 1, symbol, at, "ULONG")
+    yield MemoryEntry("checksum", words, "", 1.0, 0, 2**32 - 1, symbol, at, "ULONG", area=PARAMETERS)
 
 
 def _outputs(t: Target) -> Iterator[MemoryEntry]:
@@ -165,19 +199,60 @@ def _outputs(t: Target) -> Iterator[MemoryEntry]:
             unit = "" if signal.unit in ("SI", "1") else signal.unit
             is_share = field.name in ("refused", "saturated", "met")
             low, high = (0.0, 1.0) if is_share else (-limit, limit)
-            yield MemoryEntry(label, field.meaning, unit, 1.0, low, high, "out", at)
+            yield MemoryEntry(label, field.meaning, unit, 1.0, low, high, "out", at, area=OUTPUTS)
             at += t.real_bytes
 
 
-def _supervision() -> Iterator[MemoryEntry]:
+def _supervision(t: Target) -> Iterator[MemoryEntry]:
     """What a supervisor says; its record begins with its times."""
     at = INT_BYTES * len(TIMES)
     tables = {"state": "state_names", "enable": "", "monitor": "monitor_names", "reaction": ""}
     for k, (key, table) in enumerate(tables.items()):
-        low, high = (-1, len(MONITORS)) if key == "monitor" else (0, len(STATES))
+        low, high = (-1, len(monitor_names(t))) if key == "monitor" else (0, len(states_of(t)))
         words = "of the supervisor"
         yield MemoryEntry(
-            f"supervisor.{key}", words, "", 1.0, low, high, "supervisor", at + INT_BYTES * k, "LONG", table
+            f"supervisor.{key}",
+            *(words, "", 1.0, low, high, "supervisor", at + INT_BYTES * k, "LONG", table, SUPERVISOR),
+        )
+
+
+def _xcp_entries(t: Target) -> Iterator[MemoryEntry]:
+    """What an XCP slave shows beside that: readings, references, and what became of commits."""
+    for area, symbol, fields in (
+        (INPUTS, "in", t.input_fields),
+        (REFERENCE, "reference", t.reference_fields),
+    ):
+        at = 0
+        for field in fields:
+            for label, signal in zip(_labels(field), field.signals, strict=True):
+                unit = "" if signal.unit in ("SI", "1") else signal.unit
+                most = UNLIMITED_READING
+                yield MemoryEntry(
+                    f"{symbol}.{label}", field.meaning, unit, 1.0, -most, most, symbol, at, area=area
+                )
+                at += t.real_bytes
+    if t.wiring:
+        for area, kind, members in zip((WIRED, FOUND), ("LONG", "REAL"), wiring_results(t), strict=True):
+            at = 0
+            for key, size in members:
+                for k in range(max(size, 1)):
+                    title = f"wiring.{key}.entry_{k}" if size else f"wiring.{key}"
+                    most, words = UNLIMITED_READING if kind == "REAL" else 2.0**31 - 1, "what was found"
+                    yield MemoryEntry(title, words, "", 1.0, -most, most, "supervisor", at, kind, area=area)
+                    at += t.real_bytes if kind == "REAL" else INT_BYTES
+    for k, key in enumerate(("page", "reason", "entry", "commits")):
+        words = "of the commits of parameters"
+        yield MemoryEntry(
+            f"calibration.{key}",
+            words,
+            "",
+            1.0,
+            -1,
+            2**31 - 1,
+            "calibration",
+            INT_BYTES * k,
+            "LONG",
+            area=COMMITS,
         )
 
 
@@ -205,12 +280,14 @@ def folder_files(
     """
     name = c_name(t.controller.name)
     files = sources(t, sha256, name) | supervisor_sources(t, name) | ring_sources(t, sha256, name)
-    c_files = [file for file in files if file.endswith(".c")]
+    c_files = [file for file in files if file.endswith(".c")] + ([f"{name}_xcp.c"] if t.xcp else [])
     context = template_context(t, programs_of(t), name, sha256) | {
         "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
         "c_files": " ".join(c_files),
         "driven": t.driven,
         "logged": t.logged > 0,
+        "wiring": t.wiring,
+        "xcp": t.xcp is not None,
         "currents": len(t.current_readings) if t.driven else 0,
         **stand_in_context(t, name),
         **_example_context(t),
@@ -224,6 +301,7 @@ def folder_files(
         "CMakeLists.txt": render("CMakeLists.txt", context),
     }
     context["monitors"] = monitor_lines(t)
+    files |= xcp_sources(t, name, context)
     if t.tunable:
         files[f"{name}.a2l"] = a2l_text(t, name)
     report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof, clock=clock)
@@ -314,6 +392,7 @@ class Waiver(NamedTuple):
 DEVIATIONS = (
     Waiver("2.5", ".h", "macros of the interface are for the caller: a program need not use all of them"),
     Waiver("8.7", "_supervisor.c", "the caller too uses the table of monitors and the initialization"),
+    Waiver("8.7", "_parameters.c", "the caller too asks whether a record is refused"),
     Waiver("21.6", "_test.c", "the test prints its verdict; the controller has no output of its own"),
     Waiver("21.6", "_pil.c", "a PC has its port in the standard streams; a target defines NAME_PIL_PORT"),
     Waiver("21.15", "_pil.c", "memcpy between numbers and words: the line carries bits"),
@@ -340,6 +419,11 @@ FILES = {
     "_log.c": "the same",
     "_parameters.c": "gains, limits, references and monitors that the target may change",
     ".a2l": "their names, units and ranges for a calibration tool, ASAP2 1.7",
+    "_xcp.h": "an XCP slave for calibration tools, on UDP and a serial line",
+    "_xcp.c": "the same",
+    "_port.h": "what the law needs of a board: timer, converters, PWM, a serial line",
+    "_main.c": "a main program for a board with such a port",
+    "_xcp_pc.c": "the same on this computer, with a stand-in in place of the machine",
     "_supervisor_test.c": "a walk through its states",
 }
 
@@ -370,7 +454,9 @@ def report_text(
             "costs": found,
             "clock": clock or CLOCK,
             "sample_seconds": t.controller.sample_time,
-            "missing": f"Not found here, so not counted: {', '.join(missing)}." if missing else "",
+            "missing": f"Not {'fused, or not ' * t.fused}found here, so not counted: {', '.join(missing)}."
+            if missing
+            else "",
             "rounding_text": _rounding_text(t),
             "noise": _noise_rows(t),
             "rounding_samples": ROUNDING_SAMPLES,
@@ -382,6 +468,7 @@ def report_text(
                 for s, most in zip(t.controller.measurements, reading_ranges(t.believed), strict=True)
             ],
             "watched": watch_lines(t),
+            "transitions": transition_lines(t),
             **(_tunable_context(t, found) if t.tunable else {}),
             **(_log_context(t, found) if t.logged else {}),
             "references": [
@@ -394,7 +481,7 @@ def report_text(
 
 def _tunable_context(t: Target, found: list[ProcessorCost]) -> dict[str, Any]:
     """The section about parameters that the target may change."""
-    plain = {c.processor: c for c in costs(replace(t, tunable=False))}
+    plain = {c.processor: c for c in costs(replace(t, tunable=False, xcp=None))}
     limit = f"{100 * MIN_LIMIT_SHARE:g} % of the design's to all of it"
     words = dict.fromkeys(("force_limit", "current_limit", *ReferenceLimits._fields), limit)
     words["threshold"] = "0 to those of the table of monitors"
@@ -493,6 +580,9 @@ def export_c(
     tunable: bool = False,
     excitation: bool = False,
     log: float | None = None,
+    wiring: bool = False,
+    xcp: XcpPort | None = None,
+    fma: bool = False,
 ) -> list[Path]:
     """Write the controller of a gain file as a folder of C99 with its test and a report.
 
@@ -506,12 +596,17 @@ def export_c(
     excitation : forces beside the law's are read at every sample, which the filter knows as sent
     log : s, of the last samples that a ring buffer keeps, with a trigger; `malta log` and `malta replay` read its dump;
         None: without
+    xcp : where a slave for calibration tools listens, XcpPort(address, port, baud), parameters tunable; None: none
+    wiring : the supervisor tries sensors, coils and commutation at small voltages before the first lift-off
+    fma : products and the sums that take them are one operation, for targets that have it as an instruction; the bits
+        are other ones, and the recorded vectors are of these
 
     Returns the files.
 
     Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, duty
-    cycles of a machine without windings, and a sensor whose range nothing tells; CheckError where the export answers
-    readings within their ranges otherwise than the law of simulations.
+    cycles of a machine without windings, a wiring of a machine that nothing carries at rest, and a sensor whose
+    range nothing tells; CheckError where the export answers readings within their ranges otherwise than the law of
+    simulations.
 
     >>> import malta
     >>> gains = "design/gains/tubular_pid.json"
@@ -519,10 +614,20 @@ def export_c(
     >>> [file.name for file in files if file.suffix == ".h"]
     ['tubular_pid.h', 'tubular_pid_supervisor.h']
     """
-    path = locate(gains)
+    path = locate_gains("export_c", gains)
     if clock is not None:
         positive("export", "clock", clock, below=MAX_CLOCK_RATE)
-    target = replace(target_of(read_stable(path), precision, until), tunable=tunable, excited=excitation)
+    tunable = tunable or xcp is not None
+    target = replace(
+        target_of(read_stable(path), precision, until),
+        tunable=tunable,
+        excited=excitation,
+        xcp=xcp,
+        fused=fma,
+    )
+    if wiring:
+        target = replace(target, wiring=True)
+        wiring_table(target)  # raises before anything is proven
     if log is not None:
         target = replace(target, logged=positive("export", "log", log))
         ring_of(target, "")  # raises before anything is proven
@@ -539,6 +644,13 @@ def export_c(
     files = {folder / name: text.encode() for name, text in sorted(texts.items())}
     replace_files(files)
     return list(files)
+
+
+def locate_gains(caller: str, gains: Any) -> Path:
+    """The gain file of this name. Raises InputError for what is no name, as a Controller."""
+    if not isinstance(gains, str | Path):
+        raise InputError(caller, "gains", describe(gains), "the name of a gain file")
+    return locate(gains)
 
 
 def target_of(c: Controller, precision: Precision, until: Until | None) -> Target:

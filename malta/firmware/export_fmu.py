@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from malta.files import locate
 from malta.firmware.agreement import require_same_law
-from malta.firmware.export import Until, target_of
+from malta.firmware.export import Until, locate_gains, target_of
 from malta.firmware.fmu import Part, build_fmu
 from malta.gains.file import content_of
 from malta.gains.stable import read_stable
@@ -49,7 +48,7 @@ def export_fmu(
     >>> "modelDescription.xml" in ZipFile("build/calibrated.fmu").namelist()
     True
     """
-    path = locate(gains)
+    path = locate_gains("export_fmu", gains)
     target = replace(target_of(read_stable(path), "double", until), tunable=tunable and part != "machine")
     if part != "machine":
         require_same_law(target)

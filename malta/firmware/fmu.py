@@ -7,9 +7,10 @@ an FMU runs.
 
 A unit of co-simulation: the controller, with its supervisor, its machine, or both, as variables and C without FMI.
 
-A step takes the inputs at its beginning and leaves the outputs at its end. A master that lets the controller step first
-hands its commands to the machine in the same sample, and the machine delays them (`late`). A master that lets both step
-at once adds a sample by itself: with a delay of one sample, `late` is 0 there.
+A sample takes the inputs at its beginning and leaves the outputs at its end, also where steps are shorter than it or
+end within it. A master that lets the controller step first hands its commands to the machine in the same sample, and
+the machine delays them (`late`). A master that lets both step at once adds a sample by itself: with a delay of one
+sample, `late` is 0 there.
 """
 
 from __future__ import annotations
@@ -66,6 +67,9 @@ NOISE = CField("noise", (Signal("", "1"),), "of the sensors, in multiples of the
 SEED = CField("seed", (Signal("", "1"),), "whole number, of the noise: that of simulations with this seed")
 FLYING_FIELD = CField(
     "flying", (Signal("", "1"),), "1: the machine flies at its reference at the start, 0: it rests"
+)
+GATES_FIELD = CField(
+    "gates", (Signal("", "1"),), "1: as commanded, 0: all switches open, as supervisor.enable says"
 )
 LATE_FIELD = CField("late", (Signal("", "1"),), "1: commands act a delay later, 0: at once")
 UNLIMITED_PARAMETER = 1e30  # of a parameter without a limit
@@ -178,6 +182,7 @@ def _groups(t: Target, part: Part, m: FirmwareMachine | None) -> Iterator[Variab
             yield VariableGroup(f, "input", "discrete" if valid else "continuous", start)
     elif part == "machine":
         yield VariableGroup(command_field(t), "input", "discrete", _command_at_rest(m))
+        yield VariableGroup(GATES_FIELD, "input", "discrete", 1.0)
     for f in wrench_fields(m) if m is not None else []:
         yield VariableGroup(f, "input", "continuous", 0.0)
     if part == "supervised":

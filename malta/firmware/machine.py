@@ -7,8 +7,8 @@
     shift    (xi_pred, offset) -> xi_pred: the filter knows the offset
 
 `par` are the machine's parameters: those of the gain file at first, of which a co-simulation may change each. `normals`
-are normal numbers, the noise of the sensors over its standard deviation. Touchdown bearings push back. The functions
-come from the expressions of period.py, lowered as the controller's are. v0(z) is looked up in C.
+are normal numbers, the noise of the sensors over its standard deviation. Touchdown bearings and end stops push
+back. The functions come from the expressions of period.py, lowered as the controller's are. v0(z) is looked up in C.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ from malta.firmware.period_functions import named_function, symbols
 from malta.firmware.program import Program, build_program, lower
 from malta.firmware.signals import CField, Target
 from malta.firmware.sources import call_text, comment, head_context, number_rows, render, root_context
+from malta.firmware.supervisor_text import off_command
 from malta.model.parameters import acting_names, twins_of, units_of
 from malta.model.plant import Plant, Signal, symbolic
 from malta.simulation import references
 from malta.simulation.layout import (
     Layout,
     Setup,
+    electronics_of,
     held_size,
     layout_of,
     noise_scales,
@@ -41,7 +43,8 @@ from malta.simulation.layout import (
 )
 from malta.simulation.period import Period, initial_state, period_of, state_reference
 from malta.simulation.readings import COSINE, LOGARITHM, SINE
-from malta.simulation.scenario import Scenario, Simulation, simulation_of, substeps_of
+from malta.simulation.scenario import Scenario, Simulation, simulation_of
+from malta.simulation.steps import KINKED_STEPS, substeps_of
 
 SUBSTEP_ROUNDING = 1e-6  # share of a substep that rounding may add, see engines.substeps_until
 WAVES = {"logarithm": LOGARITHM, "cosine": COSINE, "sine": SINE}  # polynomials of the noise
@@ -85,7 +88,8 @@ class FirmwareMachine:
     @cached_property
     def substeps(self) -> float:
         """Substeps in a sample, which may be no whole number."""
-        return substeps_of(self.plant, self.target.controller, self.setup, self.simulation.scenario)
+        count = substeps_of(self.plant, self.target.controller, self.setup, self.simulation.scenario)
+        return max(KINKED_STEPS, count)  # loads of a master have kinks, as contacts have
 
     @cached_property
     def state_size(self) -> int:
@@ -103,11 +107,12 @@ class FirmwareMachine:
         return {name: ca.SX.sym(name) for name in names}
 
     def _sets_substeps(self, name: str) -> bool:
+        if electronics_of(self.plant, self.setup) is None:
+            return False
         par: Any = self.plant.parameters
         other = self.plant.variant(symbolic(par, {name: 1.01 * getattr(par, name)}))
-        return (
-            substeps_of(other, self.target.controller, self.setup, self.simulation.scenario) != self.substeps
-        )
+        given = (self.target.controller, self.setup, self.simulation.scenario)
+        return substeps_of(other, *given) != self.substeps
 
     @cached_property
     def variable(self) -> Plant:
@@ -295,6 +300,8 @@ def _context(m: FirmwareMachine, programs: Mapping[str, Program], name: str) -> 
     plant, c = m.plant, m.target.controller
 
     command = command_field(m.target)
+    electric = next(name for name in ("i", "i_phase", "i_coil") if name in m.sizes.machine)
+    flowing = places_of(m.sizes.machine)[electric]
     places = {
         "state": "s->state",
         "state_next": "s->state",
@@ -319,6 +326,8 @@ def _context(m: FirmwareMachine, programs: Mapping[str, Program], name: str) -> 
         "held": command.size,
         "acting": held_size(plant, m.setup),
         "delay": m.setup.delay,
+        "off": c_numbers(off_command(m.target) or [0.0] * command.size, "double"),
+        "flowing": {"at": flowing.start, "size": flowing.stop - flowing.start},
         "wrench": sum(f.size for f in wrench_fields(m)),
         "forces": len(c.forces),
         "volts": m.sizes.controller.get("u_integral", 0),

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache, reduce
 from typing import Any, Literal, NamedTuple
 
@@ -106,6 +107,33 @@ class Elementary:
 def polynomial(coefficients: tuple[float, ...], t: Any) -> Any:
     """Horner's scheme; the coefficient of the lowest power first."""
     return reduce(lambda value, c: c + t * value, coefficients[-2::-1], ca.SX(coefficients[-1]))
+
+
+def _logarithm(x: Any, beyond: Any) -> Any:
+    """ln x = n ln 2 + 2 artanh((m - 1) / (m + 1)) of x = 2^n m with m near 1; beyond: x - 1, as exact as it is known.
+
+    x is taken within 2^-126 .. 2^127; m is within 0.7 .. 1.41, where 11 terms of the series leave 1e-17.
+    """
+    m, n = ca.fmax(ca.fmin(x, 2.0**127), 2.0**-126), ca.SX(0)
+    for digit in range(6, -1, -1):
+        up = 2.0 ** (2**digit)
+        large, small = m >= up, m * up <= 1
+        m = ca.if_else(large, m / up, ca.if_else(small, m * up, m))
+        n += ca.if_else(large, 2**digit, ca.if_else(small, -(2**digit), 0))
+    over, under = m > math.sqrt(2), m < math.sqrt(0.5)
+    m = ca.if_else(over, m / 2, ca.if_else(under, 2 * m, m))
+    n += ca.if_else(over, 1, ca.if_else(under, -1, 0))
+    s = ca.if_else(n == 0, beyond / (2 + beyond), (m - 1) / (m + 1))
+    t = s * s
+    return n * math.log(2) + 2 * s * (1 + t * polynomial(tuple(1 / k for k in range(3, 23, 2)), t))
+
+
+def _area_of_sine(x: Any) -> Any:
+    """arsinh x = ln(1 + |x| + x^2 / (1 + sqrt(1 + x^2))) with the sign of x."""
+    size = ca.fabs(x)
+    beyond = size + size * (size / (1 + ca.sqrt(1 + size * size)))
+    found = _logarithm(1 + beyond, beyond)
+    return ca.if_else(x < 0, -found, found)
 
 
 def _power_of_two(n: Any) -> Any:
@@ -218,12 +246,21 @@ def _form_of(f: ca.Function, k: int, own: Elementary) -> Callable[..., Any]:
         "TANH": lambda x: 1 - 2 / (own.exponential(x + x) + 1),
         "ATAN2": own.arctangent,
         "ATAN": lambda x: own.arctangent(x, ca.SX(1)),
+        "ASIN": lambda x: own.arctangent(x, ca.sqrt((1 - x) * (1 + x))),
+        "ACOS": lambda x: own.arctangent(ca.sqrt((1 - x) * (1 + x)), x),
+        "LOG": lambda x: _logarithm(x, x - 1),
+        "LOG1P": lambda x: _logarithm(1 + x, x),
+        "ASINH": _area_of_sine,
+        "ACOSH": lambda x: _logarithm(x + ca.sqrt((x - 1) * (x + 1)), (x - 1) + ca.sqrt((x - 1) * (x + 1))),
+        "ATANH": lambda x: 0.5 * _logarithm((1 + x) / (1 - x), 2 * x / (1 - x)),
         "HYPOT": lambda x, y: ca.sqrt(x * x + y * y),
         "CONSTPOW": _power,
         "POW": _power,
     }
     if name not in forms:
-        raise CheckError(f"firmware has no form of CasADi's {name}: none of sines, exponentials and roots")
+        raise CheckError(
+            f"firmware has no form of CasADi's {name}: none of sines, exponentials, logarithms and roots"
+        )
     return forms[name]
 
 
@@ -416,7 +453,57 @@ def without_unused(p: Program) -> Program:
     return p._replace(operations=operations, outputs=tuple((i, j, number[k]) for i, j, k in p.outputs))
 
 
+FUSED = ("FMA", "FMS", "FNMA")  # a b + c, a b - c and c - a b, rounded once
+
+
+def fuse(p: Program) -> Program:
+    """The program with a product and the one sum that takes it as one operation, whose bits are other ones.
+
+    For targets that have it as an instruction. Of a sum of two products the first one is fused.
+    """
+    uses = Counter(a for o in p.operations for a in o.operands) + Counter(k for *_, k in p.outputs)
+    fused = list(p.operations)
+    for k, o in enumerate(p.operations):
+        if o.op not in ("ADD", "SUB"):
+            continue
+        for side, product in enumerate(o.operands):
+            if p.operations[product].op == "MUL" and uses[product] == 1:
+                op = "FMA" if o.op == "ADD" else ("FMS", "FNMA")[side]
+                fused[k] = Operation(op, (*p.operations[product].operands, o.operands[1 - side]))
+                break
+    return without_unused(p._replace(operations=tuple(fused)))
+
+
+def multiply_add(a: Any, b: Any, c: Any) -> Any:
+    """a b + c of numbers of one precision, rounded once to it.
+
+    >>> odd = 1 + 2.0**-27
+    >>> odd * odd - (1 + 2.0**-26), multiply_add(odd, odd, -(1 + 2.0**-26)) == 2.0**-54
+    (0.0, True)
+    """
+    single = np.float32 in (type(a), type(b), type(c))
+    plain = a * b + c
+    if not np.isfinite([a, b, c]).all():
+        return plain
+    exact = Fraction(float(a)) * Fraction(float(b)) + Fraction(float(c))
+    if not exact:
+        return plain  # 0 of this sign
+    try:
+        found = float(exact)
+    except OverflowError:
+        return math.inf if exact > 0 else -math.inf
+    rest = exact - Fraction(found) if single else 0
+    if rest and not np.float64(found).view(np.int64) & 1:
+        found = math.nextafter(
+            found, math.copysign(math.inf, rest)
+        )  # to odd: single precision then rounds all bits
+    return found
+
+
 _RULES: dict[str, Callable[..., Any]] = {
+    "FMA": multiply_add,
+    "FMS": lambda a, b, c: multiply_add(a, b, -c),
+    "FNMA": lambda a, b, c: multiply_add(-a, b, c),
     "ADD": lambda a, b: a + b,
     "SUB": lambda a, b: a - b,
     "MUL": lambda a, b: a * b,

@@ -41,6 +41,14 @@ class CField(NamedTuple):
         return len(self.signals)
 
 
+class XcpPort(NamedTuple):
+    """Where a slave listens by default: an address and port of UDP, and the speed of a serial line."""
+
+    address: str = "127.0.0.1"
+    port: int = 5555
+    baud: int = 115200
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """What is exported: a controller, in a precision, down to forces, axes or half-bridges."""
@@ -52,6 +60,9 @@ class Target:
     gains: GainBox | None = None  # what is proven of other gains; None: nothing was asked for
     excited: bool = False  # forces beside the law's are read at every sample
     logged: float = 0.0  # s, of a ring buffer of all signals; 0: none
+    xcp: XcpPort | None = None  # a slave for calibration tools; None: none
+    wiring: bool = False  # the supervisor tries the wiring before the first lift-off
+    fused: bool = False  # products and the sums that take them are one operation of the target
 
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):
@@ -61,9 +72,20 @@ class Target:
             raise InputError("export", self.controller.name, found, "an export down to currents")
         if self.tunable and self.controller.schedule is not None:
             raise InputError("export", "tunable", "a scheduled law", "a law of one set of gains")
+        if self.xcp is not None and not self.tunable:
+            raise InputError("export", "xcp", "an export without parameters", "one that is tunable")
         if self.driven and self.controller.current_loop is None:
             found = "a gain file with no current loops"
             raise InputError("export", self.controller.name, found, "an export down to currents")
+
+    @property
+    def steps(self) -> int:
+        """Runge-Kutta steps in a sample of recorded flights: one a time constant of the current loops, at least 4.
+
+        They are not those that simulations choose, so that the bytes of an export depend on the export alone.
+        """
+        lag = self.controller.sample_time * self.believed.actuator.crossover
+        return max(4, math.ceil(lag)) if math.isfinite(lag) else 4
 
     @property
     def believed(self) -> Plant:
@@ -243,6 +265,12 @@ class Target:
 def fidelity_of(plant: Plant) -> Fidelity:
     """How far down a machine's controller can be exported."""
     return fidelities(plant)[-1]
+
+
+@lru_cache(maxsize=16)  # what is compiled of a target is remembered by it
+def deepest_target(c: Controller) -> Target:
+    """A controller in double precision, as far down as its machine is modelled."""
+    return Target(c, "double", fidelity_of(plant_of(c.parameters)))
 
 
 def signals_after(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") -> tuple[Signal, ...]:

@@ -29,7 +29,7 @@ from malta.firmware.ctext import (
     member_place,
 )
 from malta.firmware.period_functions import table_size
-from malta.firmware.program import TYPES, Precision, Program, build_program, lower
+from malta.firmware.program import FUSED, TYPES, Precision, Program, build_program, lower
 from malta.firmware.signals import CField, Target, place_of_readings
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reference_limits
@@ -100,6 +100,7 @@ def template_context(t: Target, programs: Mapping[str, Program], name: str, sha2
         "sha256": sha256,
         "precision": t.precision,
         "precision_text": WORDS[t.precision],
+        "fused": t.fused,
         "period": f"{c.sample_time * 1e6:g} us",
         "sample_time": c_number(c.sample_time, t.precision),
         "records": _records(t, name),
@@ -146,6 +147,8 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
         "declarations": [blocks_signature(p, pieces[key], name) for key, p in others.items()],
         "loops": any(APART_SUFFIX in text for text in texts.values()),
         "parts_loops": APART_SUFFIX in functions,
+        "fma": any(o.op in FUSED for key in FUSION for o in programs[key].operations),
+        "parts_fma": any(o.op in FUSED for p in others.values() for o in p.operations),
         "root": fused_root,
         "parts_root": parts_root,
         **{f"call_{key}": blocks_call(programs[key], fused, name) for key in FUSION},
@@ -212,7 +215,7 @@ def _limit_lines(t: Target) -> list[str]:
     """The limits of references for readers: output, position, speed, acceleration."""
     limits = reference_limits(t)
     return [
-        comment(f"{s.name:<10}{p:.6g} {s.unit}, {v:.6g} {s.unit}/s, {a:.6g} {s.unit}/s^2")
+        comment(f"{s.name:<10}{p:.8g} {s.unit}, {v:.8g} {s.unit}/s, {a:.8g} {s.unit}/s^2")
         for s, p, v, a in zip(t.controller.measurements, *limits, strict=True)
     ]
 
@@ -246,6 +249,7 @@ def root_context(precision: Precision) -> dict[str, Any]:
     return {
         "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if double else 4}) != 0))",
         "builtin_root": "__builtin_sqrt" if double else "__builtin_sqrtf",
+        "library_fma": "fma" if double else "fmaf",
         "digits": 52 if double else 23,
         **{key: c_number(v, precision) for key, v in _NUMBERS.items()},
     }
@@ -367,7 +371,8 @@ def call_text(p: Program, prefix: str, places: Mapping[str, str]) -> str:
     return f"{prefix}_{p.name}({', '.join(given)})"
 
 
-# What stands in for a machine in the exported example and test: it is where its reference is, with noisy sensors.
+# What stands in for a machine in the exported example and test: it is where its reference is, or moves as the law's
+# model does, with noisy sensors.
 
 
 UNEVEN_SHARE = 1e-3  # of the bound of the currents of a star: noise of a current sensor
@@ -384,6 +389,14 @@ def stand_in_context(t: Target, name: str) -> dict[str, Any]:
     }
     if (reached := readings_at_rest(t)) is not None:
         found["reached"] = c_numbers(reached, t.precision)
+    if moves_by_model(t):
+        c = t.controller
+        C = np.hstack([c.C, np.zeros((len(c.C), len(c.Ad) - c.C.shape[1]))])
+        found |= {
+            "model": c_numbers(c.Ad, t.precision),
+            "shown": c_numbers(C, t.precision),
+            "order": len(c.Ad),
+        }
     if not t.driven:
         return found
     program = build_program(lower(phase_currents(t), t.precision))
@@ -392,6 +405,13 @@ def stand_in_context(t: Target, name: str) -> dict[str, Any]:
         "stand_in_root": any(o.op == "SQRT" for o in program.operations),
         "current_noise": c_number(UNEVEN_SHARE * bounds_of(t).uneven, t.precision),
     }
+
+
+def moves_by_model(t: Target) -> bool:
+    """Whether the stand-in moves as the law's model does: where references do not say what sensors read on the way."""
+    plant = t.believed
+    odd = not plant.second_order or len(plant.outputs) > len(plant.inputs)
+    return odd and t.controller.tracks == "states" and not t.driven
 
 
 def readings_at_rest(t: Target) -> FloatArray | None:

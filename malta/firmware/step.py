@@ -26,7 +26,7 @@ from malta.firmware.period_functions import (
     symbols,
     table_size,
 )
-from malta.firmware.program import Program, evaluate
+from malta.firmware.program import Program, evaluate, fuse
 from malta.firmware.signals import CField, Target
 from malta.model.equations import note, recorded_equations
 from malta.model.plant import Plant
@@ -231,7 +231,8 @@ Step = Callable[[Vectors, Mapping[str, Any], Mapping[str, Any]], tuple[Vectors, 
 @lru_cache(maxsize=16)
 def programs_of(t: Target) -> dict[str, Program]:
     """The programs of all functions of an export, by name."""
-    return {name: staged_program(s, t.precision) for name, s in parts_of(t).items()}
+    found = {name: staged_program(s, t.precision) for name, s in parts_of(t).items()}
+    return {name: fuse(p) for name, p in found.items()} if t.fused else found
 
 
 def look_up(t: Target, z: Any) -> Any:

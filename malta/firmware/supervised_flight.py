@@ -51,18 +51,24 @@ class Supervised(NamedTuple):
     Request: Any
 
 
+def supervised_texts(t: Target, name: str) -> list[str]:
+    """The C of controller and supervisor in the order in which it is one text."""
+    files = sources(t, "", name) | supervisor_sources(t, name)
+    order = (".h", "_supervisor.h", ".c", "_parts.c", *TUNABLES, "_supervisor.c")
+    return [files[f"{name}{end}"] for end in order if f"{name}{end}" in files]
+
+
 @lru_cache(maxsize=16)
 def compile_supervised(t: Target) -> Supervised:
     """The C of controller and supervisor, compiled. Raises InputError without a C compiler."""
     own = compile_controller(t)
-    files = sources(t, "", own.name) | supervisor_sources(t, own.name)
-    order = (".h", "_supervisor.h", ".c", "_parts.c", *TUNABLES, "_supervisor.c")
-    lib = compile_files([files[f"{own.name}{end}"] for end in order if f"{own.name}{end}" in files])
+    lib = compile_files(supervised_texts(t, own.name))
     kinds: dict[str, Any] = {
         "int32_t": ctypes.c_int32,
         "real": REALS[t.precision],
         "reference": own.Reference,
         "parameters": ctypes.c_void_p,
+        "calibration": ctypes.c_void_p,
     }
 
     def record(title: str, members: Sequence[Member]) -> Any:

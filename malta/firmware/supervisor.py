@@ -36,7 +36,7 @@ from malta.synthesis.riccati import dare
 # Of the process noise's variance, for a filter that does without a sensor. For none at all the Kalman filter is the one
 # of least gain that is stable: two unstable modes seen by one sensor take large gains, which noise and errors grow by.
 # One that keeps its estimates of disturbances has to follow new ones by its other states, and so has to be faster.
-TRUST, TRUST_KEPT = 2e-6, 5e-5
+TRUST, TRUST_KEPT = 3e-8, 5e-5
 PLACES = 9  # along the stroke, for which there are such gains
 
 
@@ -84,7 +84,9 @@ def gains_without(t: Target) -> ReducedFilterGains:
         for n, trust in sizes:
             seen = [(A[:n, :n], C[:, :n]) for A, C in models]
             gains = [
-                _gain_without(k, A, C, trust * W[:n, :n], V) for A, C in seen if _sees_instability(k, A, C)
+                _gain_without(k, A, C, _reduce_noise(k, A, C, trust, W[:n, :n]), V)
+                for A, C in seen
+                if _sees_instability(k, A, C)
             ]
             stable = [np.vstack([L, np.zeros((len(W) - n, len(V)))]) for L in gains if L is not None]
             if len(stable) == len(models):
@@ -108,6 +110,19 @@ def _process_noise(c: Controller) -> FloatArray:
             drift = back @ drift @ back.T
         W[-len(c.forces) :, -len(c.forces) :] = drift
     return W
+
+
+def _reduce_noise(k: int, A: FloatArray, C: FloatArray, trust: float, W: FloatArray) -> FloatArray:
+    """The process noise, with this share of it for the states that act on sensor k; the others keep theirs.
+
+    A filter that trusts its prediction of a stroke lags behind it, and so looks up its loads at another place.
+    """
+    acts = np.abs(C[k]) > 0
+    couples = np.abs(A) > ROUNDING * np.abs(A).max(axis=1, keepdims=True)
+    for _ in range(len(A)):
+        acts = acts | couples[acts].any(axis=0)
+    share = np.where(acts, math.sqrt(trust), 1.0)
+    return share[:, None] * W * share
 
 
 def _sees_instability(k: int, A: FloatArray, C: FloatArray) -> bool:
@@ -172,7 +187,9 @@ def prediction_correction(t: Target) -> ca.Function:
     return ca.Function("correction", [xi], [ca.densify(more)], ["xi_hat"], ["more"])
 
 
-State = Literal["OFF", "OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "HOLD", "LANDING", "FAULT"]
+State = Literal[
+    "OFF", "OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "HOLD", "LANDING", "FAULT", "WIRING"
+]
 Reaction = Literal["NONE", "IGNORE", "HOLD", "LAND", "FAULT"]
 
 STATES: dict[State, str] = {
@@ -205,9 +222,44 @@ TRANSITIONS: tuple[tuple[State, str, State], ...] = (
     *((state, "FAULT", "FAULT") for state in IN_USE),
     ("FAULT", "ACKNOWLEDGE", "OFF"),
 )
+WIRING_STATES: dict[State, str] = {"WIRING": "small voltages; what sensors and currents answer is looked at"}
+WIRING_TRANSITIONS: tuple[tuple[State, str, State], ...] = (
+    ("SENSORS", "WIRE", "WIRING"),
+    ("WIRING", "DONE", "LIFT"),
+    ("WIRING", "LAND", "OFF"),
+    ("WIRING", "FAULT", "FAULT"),
+)
+
+
+def transitions_of(*, wiring: bool) -> tuple[tuple[State, str, State], ...]:
+    """The transitions of a supervisor: from a state, by an event, to another state."""
+    return (*TRANSITIONS, *WIRING_TRANSITIONS) if wiring else TRANSITIONS
+
+
+def states_of(t: Target) -> dict[State, str]:
+    """The states of a target's supervisor, each with its meaning, in the order of their numbers."""
+    return STATES | (WIRING_STATES if t.wiring else {})
+
+
+def monitor_names(t: Target) -> tuple[str, ...]:
+    """The names of monitors, in the order of their numbers."""
+    return (*MONITORS, "WIRING") if t.wiring else MONITORS
+
 
 MONITORS = (
-    *("TOUCH", "RANGE", "RATE", "INNOVATION", "STUCK", "STALE", "NAN", "UNBELIEVED", "BLIND"),
+    *(
+        "TOUCH",
+        "FOLLOWING",
+        "RANGE",
+        "RATE",
+        "INNOVATION",
+        "STROKE",
+        "STUCK",
+        "STALE",
+        "NAN",
+        "UNBELIEVED",
+        "BLIND",
+    ),
     *("ASTRAY", "HELPLESS", "MISSED", "CURRENT", "OFFSET", "LINK", "SATURATION", "REFERENCE"),
     *(
         "UNSETTLED",
@@ -232,17 +284,35 @@ JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a re
 # stuck: within the time that noise allows, a law that follows such a reading throws the machine against its bearing.
 REPEATS, UNMOVED_DEVIATIONS = 12, 16.0
 FALSE_ALARM = 1e-15  # probability at a sample that working sensors repeat a value as long as a stuck one
+# By so many deviations, and what disturbances can do in so many samples, a reading may leave what the filter expects.
+LEAP, LEAP_SAMPLES = 8.0, 4
+HELD_SAMPLES = 3  # in which a sensor that leapt may turn out to be noisy, and nothing is corrected
 DISTURBANCE_SHARE = 0.05  # of the largest acceleration: a machine may leave the filter's prediction by it
 # Share of the largest acceleration with which references stop. Twice as much takes the voltage that the bearings need
 # when the link sags by 90 %, and ends in a touchdown.
 STOPPING_SHARE = 0.1
+EXCITATION_SHARE = 0.5  # of the limits of forces, that an excitation may have in operation
 HELPLESS_SAMPLES = 10  # with a force at its limit and a sensor ignored, until it is a fault
-BRIDGED_SAMPLES = 10  # samples for which a sensor is ignored before the reference stops
+BRIDGED_SAMPLES = 10  # most samples for which a sensor is ignored before the reference stops
+# Good readings in a row until an ignored sensor is believed again, and the share of the way to a touchdown by which
+# they may be off what the filter expects: one that follows more of it throws the machine.
+AGREEMENT, BELIEVED_SHARE = 3, 0.1
+# How often a sensor was wrong is remembered for so many believed readings, up to so many times: one that errs again and
+# again, as by a bit that sticks, would be followed in between.
+LAPSE_SAMPLES, MOST_LAPSES = 400, 4
+# A stroke has room to be thrown: its sensor lies when it is so many deviations off what the filter expects.
+LOST_WAY = 16.0
+# Shares of a cushioned clearance, or of the travel, that a reading may be off its reference; times FREER in a lift and
+# a landing, where bearings push.
+ASTRAY_SHARE, ASTRAY_STROKE, FREER = 0.4, 0.1, 2.5
 SETTLED_DEVIATIONS = 12.0  # standard deviations of readings that errors may have
 SAG_SHARE = 0.3  # share of the link's voltage that is missing
 OFFSET = 0.02  # largest offset of a current sensor as a share of the current limit
 OVERVOLTAGE = 0.2  # share of the link's voltage that is too much
 LOST_CURRENT = 5  # samples without a reading of a current: a loop that acts on an old one drives it away
+TORN_SHARE = (
+    0.3  # the same, for gates off at once: a loop that follows a wrong reading drives its current away
+)
 IMBALANCE_SHARE = 0.04  # of the current limit: the sum of a star's currents, with its sensors' offsets
 # Shares of the current limit, on average over MEAN samples: by the first a current may miss its command, else it lands
 # after MISSES samples; by the second it may exceed it, else it is off at once. What stays below its command pushes no
@@ -250,6 +320,9 @@ IMBALANCE_SHARE = 0.04  # of the current limit: the sum of a star's currents, wi
 ASTRAY_CURRENT, LOST_CONTROL = 0.1, 0.6
 MEAN = 32.0
 MISSES = 100
+FROZEN_SAMPLES = (
+    8  # in which one reading of an uneven star repeats: it is the wrong one, and the others tell it
+)
 FREEZE = 20  # samples in which no current of a star changes although the commands do
 LATENESS = (0.2, 0.5)  # share of missed steps, averaged over MEMORY samples: hold, land
 RESERVED_SHARE = 0.1  # share of a way to a touchdown or of a travel that references leave free
@@ -289,14 +362,18 @@ class MonitorLimits:
     touch: FloatArray  # p, of readings: near a touchdown or the end of the travel
     range: FloatArray  # p, of readings: see signals.reading_ranges
     jump: FloatArray  # p, of readings from sample to sample
+    leap: FloatArray  # p, of what a reading is off the filter's prediction, from sample to sample
     sigma: FloatArray  # p, standard deviation of a reading, with its resolution
     unmoved: FloatArray  # p, of references while a reading repeats
     settled: FloatArray  # p, of errors
     drift: FloatArray  # p, of what the filter expects without readings, per sample^2
+    nearest: FloatArray  # p, by which an ignored sensor may differ from them at most, to be believed again
+    astray: FloatArray  # p, of readings off their references
     stopping: FloatArray  # p, per s^2, of a reference that stops
     stuck: tuple[int, ...]  # p, samples with one value from which on a sensor is stuck
     stale: int  # the same, of all sensors at once
     unbelieved: int  # samples that a sensor may be ignored
+    bridged: int  # samples for which a sensor is ignored before the reference stops: before it lands
     current: float  # A, of a reading
     deviation: float  # A, of a current from its command, on average
     uneven: float  # A, of the currents of a star
@@ -318,22 +395,29 @@ def bounds_of(t: Target) -> MonitorLimits:
     speed = np.sqrt(4 * acceleration * touch)
     known = np.where(sigma > 0, sigma, np.inf)
     quiet = np.where(np.isfinite(touch), 0.01 * touch, np.minimum(reading_ranges(plant), 1.0) / 100)
+    strokes = np.arange(len(touch)) == (plant.stroke_output if plant.has_stroke else -1)
+    unbelieved = _samples_without_reading(c)
     stopping = np.where(np.isfinite(acceleration), STOPPING_SHARE * acceleration, np.inf)
     stuck = tuple(_repetitions([p]) for p in repetition_probabilities(plant))
+    drift = np.where(
+        np.isfinite(acceleration), DISTURBANCE_SHARE / 2 * acceleration * c.sample_time**2, np.inf
+    )
     return MonitorLimits(
         touch=touch,
         range=reading_ranges(plant),
         jump=speed * c.sample_time + math.sqrt(2) * JUMP * sigma,
+        leap=np.where(strokes, np.inf, LEAP * known + LEAP_SAMPLES**2 * drift),
         sigma=known,
         settled=np.where(sigma > 0, SETTLED_DEVIATIONS * sigma, quiet),
-        drift=np.where(
-            np.isfinite(acceleration), DISTURBANCE_SHARE / 2 * acceleration * c.sample_time**2, np.inf
-        ),
+        drift=drift,
+        nearest=BELIEVED_SHARE * touch,
+        astray=np.where(strokes, ASTRAY_STROKE, ASTRAY_SHARE) * touch,
         stopping=stopping,
         unmoved=np.where(np.array(stuck) < ENDLESS_SAMPLES, UNMOVED_DEVIATIONS * known, np.inf),
         stuck=stuck,
         stale=_repetitions(repetition_probabilities(plant)),
-        unbelieved=_samples_without_reading(c),
+        unbelieved=unbelieved,
+        bridged=min(BRIDGED_SAMPLES, unbelieved - 1),
         current=OVERCURRENT_FACTOR * largest_reading(t),
         offset=OFFSET * float(np.max(c.limits.current)) if t.driven else math.inf,
         deviation=ASTRAY_CURRENT * float(np.max(c.limits.current)) if t.driven else math.inf,
@@ -346,20 +430,27 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
     b = bounds_of(t)
     checked: tuple[State, ...] = ("SENSORS", *IN_FLIGHT)
     moving: tuple[State, ...] = ("OPERATE", "HOLD")
+    lifting: tuple[State, ...] = ("LIFT", "LANDING")
     ground: tuple[State, ...] = ("OFFSETS", "SENSORS")
     off = LOST_CONTROL / ASTRAY_CURRENT * b.deviation
+    apart = TORN_SHARE / IMBALANCE_SHARE * b.uneven
     # Without a filter that does without the sensor, a fall is softer than a landing by prediction alone.
     without: Reaction = "LAND" if gains_without(t).L else "FAULT"
     listed = [
         Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", IN_OPERATION),
+        Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", ("LIFT",)),
+        Monitor("TOUCH", "reading over the bound of a touchdown", 1.3, 5, "FAULT", ("LANDING",)),
+        Monitor("FOLLOWING", "error of a reading, by what it may be", 1.0, 3, "FAULT", IN_OPERATION),
+        Monitor("FOLLOWING", "error of a reading, by what it may be", FREER, 3, "FAULT", lifting),
         Monitor("RANGE", "reading over what can be read", 1.0, 1, "IGNORE", checked),
         Monitor("RATE", "jump of a reading over what the machine can do", 1.0, 1, "IGNORE", IN_FLIGHT),
         Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 20, "HOLD", moving),
         Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 400, "LAND", moving),
+        Monitor("STROKE", "|y - h(xi_pred)| of the stroke over sigma", LOST_WAY, 10, "FAULT", IN_FLIGHT),
         Monitor("STUCK", "repetitions over what noise or motion allow", 1.0, 1, "IGNORE", checked),
         Monitor("STALE", "repetitions of all sensors at once", b.stale - 0.5, 1, "IGNORE", checked),
         Monitor("NAN", "no number, or called invalid", 0.5, 1, "IGNORE", checked),
-        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, BRIDGED_SAMPLES, "HOLD", moving),
+        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.bridged, "HOLD", moving),
         Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.unbelieved, without, IN_FLIGHT),
         Monitor("BLIND", "all sensors are ignored", 0.5, b.unbelieved, "FAULT", IN_FLIGHT),
         Monitor(
@@ -383,6 +474,7 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
             "CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "FAULT", ("SENSORS",)
         ),
         Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "LAND", IN_FLIGHT),
+        Monitor("CURRENT_SUM", "currents of a star together, A", apart, 3, "FAULT", IN_FLIGHT),
         Monitor(
             "CURRENT_FROZEN", "samples without change, commands move", FREEZE - 0.5, 1, "FAULT", IN_FLIGHT
         ),
@@ -402,16 +494,31 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("UNREADY", "samples without good readings", 8.0 * TIMES.check, 1, "FAULT", ("SENSORS",)),
     ]
     absent = absent_monitors(t)
-    return tuple(row for row in listed if row.key not in absent)
+    rows = tuple(row for row in listed if row.key not in absent)
+    if not t.wiring:
+        return rows
+    own = Monitor("WIRING", "the wiring is not as expected", 0.5, 1, "FAULT", ("WIRING",))
+    watched = tuple(
+        row._replace(states=(*row.states, "WIRING")) if row.states in (IN_USE, ground) else row
+        for row in rows
+    )
+    return (*watched, own)
 
 
 def absent_monitors(t: Target) -> dict[str, str]:
     """The monitors that make no sense for a target's machine, each with the reason."""
     b = bounds_of(t)
+    plant = t.believed
+    stroke = plant.has_stroke and t.controller.tracks == "states"
     unlimited = not np.isfinite(t.controller.limits.force).any()
     faulty_at_once = len(t.controller.measurements) == 1 or not gains_without(t).L
     listed = (
-        (not np.isfinite(b.touch).any(), "nothing is met", ("TOUCH",)),
+        (not np.isfinite(b.touch).any(), "nothing is met", ("TOUCH", "FOLLOWING")),
+        (
+            not (stroke and np.isfinite(b.sigma[plant.stroke_output] + b.touch[plant.stroke_output])),
+            "no filter knows a stroke",
+            ("STROKE",),
+        ),
         (not np.isfinite(b.jump).any(), "no speed is too large", ("RATE",)),
         (not np.isfinite(b.sigma).any(), "no noise of the sensors is known", ("INNOVATION",)),
         (min(b.stuck) >= ENDLESS_SAMPLES, "readings of a sensor that works repeat", ("STUCK",)),
@@ -561,7 +668,7 @@ def reference_limits(t: Target) -> ReferenceLimits:
     fastest, steepest = reachable_rates(t.controller, position)
     acceleration = np.minimum(np.where(np.isfinite(most), most, steepest), MOST_RATE)
     speed = np.minimum(np.minimum(np.sqrt(4 * acceleration * position), fastest), MOST_RATE)
-    limits = ReferenceLimits(position, speed, acceleration)
+    limits = ReferenceLimits(*(_written_limits(values) for values in (position, speed, acceleration)))
     if not t.controller.references.size:
         return limits
     reach = np.minimum(touch, reading_ranges(t.believed))
@@ -575,6 +682,13 @@ def reference_limits(t: Target) -> ReferenceLimits:
             )
     asked_for = zip(t.controller.references, limits, strict=True)
     return ReferenceLimits(*(np.where(given > 0, given, own) for given, own in asked_for))
+
+
+def _written_limits(values: FloatArray) -> FloatArray:
+    """Limits of as many digits as texts have, not above the values: what a reader types is within them."""
+    nearest = np.array([float(f"{v:.8g}") for v in values])
+    below = np.array([float(f"{v * (1 - 5e-8):.8g}") for v in values])
+    return np.where(nearest <= values * (1 + ROUNDING), nearest, below)
 
 
 def _samples_without_reading(c: Controller) -> int:

@@ -17,31 +17,41 @@ from malta.arrays import FloatArray
 from malta.firmware.ctext import c_number, function_text
 from malta.firmware.program import Program, build_program, lower
 from malta.firmware.signals import Target
-from malta.firmware.sources import arithmetic_context, head_context, render
+from malta.firmware.sources import arithmetic_context, head_context, render, root_context
 from malta.firmware.supervisor import (
+    AGREEMENT,
     ENDLESS_SAMPLES,
+    EXCITATION_SHARE,
+    FREER,
+    FROZEN_SAMPLES,
+    HELD_SAMPLES,
     JUMP,
+    LAPSE_SAMPLES,
     MEAN,
-    MONITORS,
+    MOST_LAPSES,
     MOST_RATE,
     REACTIONS,
     REPEATS,
     SAG_SHARE,
     STATES,
     TIMES,
-    TRANSITIONS,
     Monitor,
     State,
     bounds_of,
     current_deviations,
     expected_readings,
     gains_without,
+    monitor_names,
     monitors_of,
     prediction_correction,
     reference_limits,
     stars_of,
+    states_of,
+    transitions_of,
 )
+from malta.firmware.wiring import wiring_context, wiring_members
 from malta.simulation.layout import electronics_of
+from malta.synthesis.controller import Controller
 
 MIN_STOP_SAMPLES = 20.0  # samples in which a reference stops at least
 FADE_SAMPLES = 40.0  # samples in which an acceleration fades that the next state does not have
@@ -53,7 +63,7 @@ MOST_MISSED = 1_000_000  # steps that count as missed
 class Member(NamedTuple):
     """A member of a record: a number, an array of them, or another record."""
 
-    kind: Literal["int32_t", "real", "times", "reference", "parameters"]
+    kind: Literal["int32_t", "real", "times", "reference", "parameters", "calibration"]
     name: str
     size: int  # 0: no array
     meaning: str
@@ -110,16 +120,28 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("int32_t", "samples", 0, "since the state began"),
         Member("int32_t", "steady", 0, "samples in a row of what the state waits for"),
         Member("int32_t", "count", rows * p, "samples in a row over the threshold, of each row and output"),
+        Member("int32_t", "agreed", p, "samples in a row in which a sensor reads what is expected"),
+        Member("int32_t", "lapses", p, "how often a sensor was wrong lately"),
+        Member("int32_t", "leapt", 0, "the sensor that left what was expected, until it is believed; or -1"),
+        Member("real", "leap", 0, "by how much it did"),
         Member("int32_t", "repeated", p, "samples for which a reading has been the same"),
         Member("real", "since", p, "references when readings changed last"),
+        Member("int32_t", "seeing", 0, "sensors that were believed at the last sample"),
         Member("int32_t", "unchanged", 0, "the same of all readings"),
         Member("real", "rest", p, "readings of the machine at rest"),
         Member("real", "last", p, "last readings"),
         Member("real", "noise", p, "mean of the last readings' jumps"),
+        Member("real", "error", p, "mean of the last readings off their references"),
+        Member("real", "usual", p, "mean of those believed off what the filter expected, each up to a jump"),
+        Member("real", "away", p, "what the last believed ones were off it"),
+        Member("real", "shift", p, "mean of what they were off it lately, either way"),
+        Member("real", "unrest", 0, "mean of by how much the second of them left it from sample to sample"),
         Member("real", "limited", p, "1 where a force was at its limit"),
         Member("int32_t", "followed", 0, "1 from the first request that was within its limits"),
         Member("real", "asked", p, "last reference that was requested within its limits"),
         Member("real", "asked_rate", p, "its rate"),
+        Member("int32_t", "paced", p, "1 where its rate is that of its places"),
+        Member("int32_t", "steered", 0, "outputs whose references are on their way to what is requested"),
         Member("real", "place", p, "where the references go"),
         Member("real", "lasts", p, "s, how long they take"),
         Member("real", "stops", p, "s, in which the rate fades that they had"),
@@ -128,7 +150,12 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("real", "d2", p, ""),
     ]
     if t.tunable:
-        members.append(Member("parameters", "parameters", 0, "those of the controller's last step"))
+        members += [
+            Member("parameters", "parameters", 0, "those of the controller's last step"),
+            Member("calibration", "calibration", 0, "what samples take their parameters from; NULL: nothing"),
+            Member("int32_t", "refused", 0, "why the last start was refused; 0: it was not"),
+            Member("int32_t", "refused_entry", 0, "number of the record that was out of its range, or -1"),
+        ]
     if t.driven:
         members.append(Member("real", "offset", len(t.current_readings), "A, of the current sensors"))
         members.append(Member("real", "current", len(t.believed.actuator.coils), "A, commanded"))
@@ -140,7 +167,16 @@ def supervisor_members(t: Target) -> list[Member]:
         members.append(Member("real", "beyond_mean", len(t.believed.drive.axes), "A, of axes beyond them"))
         if stars_of(t):
             members.append(Member("int32_t", "still", len(stars_of(t)), "samples without change of a star"))
+            members.append(
+                Member("real", "raw_current", len(t.current_readings), "A, last readings as they came")
+            )
+            members.append(
+                Member("int32_t", "same_current", len(t.current_readings), "samples in which each repeats")
+            )
             members.append(Member("int32_t", "inferred", 0, "currents that the others of their stars tell"))
+    if t.wiring:
+        members.append(Member("int32_t", "wired", 0, "1: as it should be, -1: not, 0: not tried"))
+        members += [Member(*row) for row in wiring_members(t)]
     return members
 
 
@@ -169,22 +205,23 @@ def _context(t: Target, name: str) -> dict[str, Any]:
     """What the templates of a supervisor are filled with."""
     c, plant = t.controller, t.believed
     times = TIMES if t.driven else TIMES._replace(offsets=0)
-    off = _off_command(t)
+    off = off_command(t)
     return head_context(t, name) | {
         "tunable": t.tunable,
         "logged": t.logged > 0,
-        "states": list(STATES),
-        "monitors": MONITORS,
+        "states": list(states_of(t)),
+        "monitors": monitor_names(t),
         "reactions": REACTIONS,
-        "transitions": TRANSITIONS,
+        "transitions": transitions_of(wiring=t.wiring),
         "rows": [_row(row, t) for row in monitors_of(t)],
-        "state_lines": [f"{key.lower():<10}{words}" for key, words in STATES.items()],
+        "state_lines": [f"{key.lower():<10}{words}" for key, words in states_of(t).items()],
         "monitor_lines": monitor_lines(t),
         "records": _records(t, name),
         "times": list(times._asdict().items()),
         "outputs": len(c.measurements),
         "forces": len(c.forces),
         "estimated": len(c.states),
+        "rates": _rates(c),
         "input_fields": t.input_fields,
         "output_fields": [f for f in t.output_fields if f.size],
         "currents": len(t.current_readings) if t.driven else 0,
@@ -194,6 +231,8 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "stars": stars_of(t),
         "moves": _number(1e-4 * float(np.max(c.limits.current)), t),
         "limits": {key: _vector(values, t) for key, values in reference_limits(t)._asdict().items()},
+        "excited": t.excited,
+        "excitation": _vector(EXCITATION_SHARE * np.asarray(c.limits.force), t),
         "command": len(off),
         "off": _vector(off, t),
         "stroke_output": plant.stroke_output if plant.has_stroke else -1,
@@ -202,18 +241,61 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "longest": ENDLESS_SAMPLES,
         "arithmetic": arithmetic_context(t.precision),
         "most_missed": MOST_MISSED,
+        **root_context(t.precision),
+        "uneven": _number(bounds_of(t).uneven, t),
+        "frozen_samples": FROZEN_SAMPLES,
         **_bounds(t),
         **_filters(t, name),
         **{key: c_number(value, t.precision) for key, value in _NUMBERS.items()},
+        **wiring_context(t),
+        "wiring_members": [Member(*row) for row in wiring_members(t)] if t.wiring else [],
     }
 
 
-def _bounds(t: Target) -> dict[str, str]:
+def _rates(c: Controller) -> int:
+    """How many positions of the filter are followed by their rates, in this order; 0 where its states are others."""
+    half = len(c.A) // 2
+    top = np.hstack([np.zeros((half, half)), np.eye(half)])
+    return half if c.tracks == "states" and len(c.A) == 2 * half and np.array_equal(c.A[:half], top) else 0
+
+
+def _place_rows(t: Target) -> str:
+    """C of the filter's positions that readings add to; "" where positions do not give every reading by itself."""
+    c, half = t.controller, _rates(t.controller)
+    C = c.C[:, :half]
+    return _matrix(np.linalg.pinv(C), t) if half and np.linalg.matrix_rank(C) == len(C) else ""
+
+
+def _bounds(t: Target) -> dict[str, Any]:
     """The limits of the outputs."""
     b = bounds_of(t)
-    names = ("touch", "range", "jump", "sigma", "unmoved", "settled", "drift", "stopping")
+    names = (
+        "touch",
+        "range",
+        "jump",
+        "leap",
+        "sigma",
+        "unmoved",
+        "settled",
+        "drift",
+        "nearest",
+        "astray",
+        "stopping",
+    )
     stuck = {"stuck": ", ".join(map(str, b.stuck)), "repeats": str(REPEATS)}
-    return {name: _vector(getattr(b, name), t) for name in names} | stuck
+    counts = {
+        "agreement": AGREEMENT,
+        "bridged": b.bridged,
+        "held": HELD_SAMPLES,
+        "most_lapses": MOST_LAPSES,
+        "lapse_samples": LAPSE_SAMPLES,
+        "unbelieved": b.unbelieved,
+        "uncommanded": _number(b.deviation, t),
+        "leaps": bool(gains_without(t).L),
+        "loose": not t.believed.has_stroke and np.isinf(b.touch).any() and np.isfinite(b.touch).any(),
+        "endless": _number(1e17, t),
+    }
+    return {name: _vector(getattr(b, name), t) for name in names} | stuck | counts
 
 
 def _filters(t: Target, name: str) -> dict[str, Any]:
@@ -234,12 +316,12 @@ def _filters(t: Target, name: str) -> dict[str, Any]:
     return {
         "tracks_errors": c.tracks == "errors",
         "fallback": bool(gains.L),
+        "rejoined": _place_rows(t) if gains.L else "",
         "places": len(places),
         "first_place": _number(float(places[0]), t),
         "apart": _number(float(np.ptp(places)) / max(len(places) - 1, 1), t),
         "has_gain": ", ".join(str(int(k in gains.L)) for k in range(p)),
         "gain_rows": ",\n".join(blocks),
-        "root": any(o.op == "SQRT" for program in programs.values() for o in program.operations),
         **{key: function_text(program, name, t.precision, static=True) for key, program in programs.items()},
     }
 
@@ -274,6 +356,15 @@ _NUMBERS = {
     "three_halves": 1.5,
     "most": 1e30,  # of a reading that is a number
     "believed": JUMP,
+    "beside": 0.1,  # share of a clearance, by which a machine is read beyond the place where it rests
+    "recent_miss": 0.004,  # share of missed steps, below which the last one is some milliseconds ago
+    "error_share": 1 / 8,  # of a following error in its mean
+    "quarter": 0.25,  # of a leap, that noise is on average
+    "apart_from_others": 4.0,  # times what others leave the filter by from sample to sample
+    "lost_with_all": 1.5,  # leaps, that readings may be off the filter more than they were
+    "lost_alone": 3.0,  # leaps, that they may be off a filter that does without a sensor
+    "ahead": 4.0,  # in times of this mean
+    "freer": FREER,
     "jump_deviations": math.sqrt(2) * JUMP,
     "mean_jump": 2 / math.sqrt(math.pi),
     "memory": 1 / MEMORY,
@@ -283,6 +374,9 @@ _NUMBERS = {
     "passing": MAX_OVERSHOOT,
     "most_rate": MOST_RATE,
     "sagging": SAG_SHARE,
+    "gentle": 0.75,  # of the acceleration limit, with which a reference goes to its request
+    "least_share": 0.25,  # the same beside the acceleration of the request
+    "exceeding": 1.00001,  # times a limit, by which sums of single precision may be over it
     "rounding": 1e-5,  # of a limit, by which references of two samples may differ beyond it
     "fade_rate": 3.95,  # at least the largest second derivative of (1 - u)^3 (u + 3 u^2)
     "fade_speed": 15 / 8 / 0.75,
@@ -292,13 +386,13 @@ _NUMBERS = {
 
 def _row(row: Monitor, t: Target) -> dict[str, Any]:
     """A row of the table of monitors for the template."""
-    bits = sum(1 << k for k, state in enumerate(STATES) if state in row.states)
+    bits = sum(1 << k for k, state in enumerate(states_of(t)) if state in row.states)
     threshold = c_number(row.threshold, t.precision)
     return row._asdict() | {"threshold": threshold, "states": bits}
 
 
-def _off_command(t: Target) -> list[float]:
-    """What is commanded for no voltage, or for no current of electronics that take set points."""
+def off_command(t: Target) -> list[float]:
+    """What is commanded for no voltage, or for no current of electronics that take set points; else nothing."""
     if t.has_set_points:
         electronics = electronics_of(t.believed, t.setup)
         if electronics is None:
@@ -327,8 +421,8 @@ def _records(t: Target, name: str) -> list[dict[str, Any]]:
 def _line(member: Member, name: str) -> str:
     """A member of a struct, with its meaning."""
     kind = member.kind if member.kind == "int32_t" else f"{name}_{member.kind}"
-    if member.kind == "parameters":
-        kind = f"const {kind} *"
+    if member.kind in ("parameters", "calibration"):
+        kind = f"const {kind} *" if member.kind == "parameters" else f"{kind} *"
     size = f"[{member.size}]" if member.size else ""
     text = f"{kind} {member.name}{size};"
     return f"{text} /* {member.meaning} */" if member.meaning else text

@@ -20,13 +20,15 @@ from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.program import Program, evaluate
 from malta.firmware.signals import Target, reading_ranges
-from malta.firmware.sources import FUSION, call_text, piece_records, readings_at_rest
+from malta.firmware.sources import FUSION, call_text, moves_by_model, piece_records, readings_at_rest
 from malta.firmware.step import first_state, programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor import (
+    AGREEMENT,
     ENDLESS_SAMPLES,
     IN_USE,
     JUMP,
     MONITORS,
+    MOST_LAPSES,
     REACTIONS,
     STATES,
     TRANSITIONS,
@@ -37,6 +39,8 @@ from malta.firmware.supervisor import (
     expected_readings,
     monitors_of,
     reference_limits,
+    states_of,
+    transitions_of,
 )
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
@@ -79,6 +83,7 @@ def _flight(t: Target, *, stroke: bool) -> dict[str, FloatArray]:
     c, plant = t.controller, t.believed
     lasts = SAMPLES * c.sample_time
     options: Any = {"noise": 1.0, "fidelity": "force" if not t.driven else t.fidelity}
+    options["substeps"] = t.steps
     if stroke and plant.has_stroke and plant.stroke.travel:
         scenario = Scenario.stroke(_distance(t, lasts / 6), rise=lasts / 6, duration=lasts, **options)
     else:
@@ -162,7 +167,13 @@ def checksum(values: Any, begin: int = FNV_START) -> int:
 # act by a fault, in each state in which it counts; templates/calls.c calls the other functions of the header.
 
 
+LONGEST_WISH, SLOW_WISH = (
+    2000,
+    20_000,
+)  # samples until a state is reached, at most; of a machine that has to settle
 MAX_TRIAL_SAMPLES = 600  # samples until a row acts, the middle of long times left out
+SLOWLY = 50  # samples, in which the filter's expectation leaves the readings
+SAME_SHARE = 1e-9  # share by which readings differ that tell the same of the states
 PIECE_SCALE = 2.0**-25  # of drawn whole numbers up to 2^15: 1e-3
 PIECE_TIME = 0.02  # s, of a rise, and m, of a pole
 STROKE_SAMPLES = 20.0  # of a rise
@@ -201,7 +212,6 @@ def _only_stroke(t: Target) -> bool:
 def trial_context(t: Target, name: str) -> dict[str, Any]:
     """What trials.c and calls.c are filled with. name : the controller's"""
     b, c = bounds_of(t), t.controller
-    seen, per_unit = _shown_states(t)
     return {
         "states": list(STATES),
         "monitors": MONITORS,
@@ -212,18 +222,20 @@ def trial_context(t: Target, name: str) -> dict[str, Any]:
         "estimated": len(c.states),
         "observed": c.observed,
         "tracks_errors": c.tracks == "errors",
-        "over": _faults(t, per_unit),
+        "over": _faults(t),
         "moved": _motion_near_end(t),
-        "seen": ", ".join(map(str, seen)),
         "stuck": ", ".join(map(str, b.stuck)),
         "stale": b.stale,
         "longest": ENDLESS_SAMPLES,
         "longest_trial": MAX_TRIAL_SAMPLES,
+        "longest_disbelief": 2 * AGREEMENT * 4 ** (MOST_LAPSES - 1),
+        "longest_wish": SLOW_WISH if moves_by_model(t) else LONGEST_WISH,
         "sensors": ", ".join(f"{_sensors(row, t)}u" for row in monitors_of(t)),
         "out_of_reach": ", ".join(f"{_unreached_states(row, t)}u" for row in monitors_of(t)),
         "moves_otherwise": not t.believed.second_order,
         "unreached": _unreached_lines(t),
         "never_act": [k for k, row in enumerate(monitors_of(t)) if not _tried_states(row, t)],
+        **_expectation(t),
         **_strokes(t),
         **_pieces(t, name),
     }
@@ -235,25 +247,25 @@ def _place_of_rest(t: Target, sizes: FloatArray) -> FloatArray:
     return np.asarray(sizes * (-1.0) ** np.arange(len(sizes)) if reached is None else reached @ sizes)
 
 
-def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
+def _faults(t: Target) -> dict[str, str]:
     """How large faults are, so that their monitors act and no stronger one before them."""
     b, c = bounds_of(t), t.controller
     limits = np.asarray(c.limits.force, dtype=float)
     currents = np.broadcast_to(c.limits.current, len(t.believed.actuator.coils))
     sigma = np.where(np.isfinite(b.sigma), b.sigma, 0.0)
     numbers: dict[str, Any] = {
-        "touch": 1.2 * b.touch,
+        "touch": 1.5 * b.touch,
         "range": 2 * b.range,
         "jump": 3 * b.jump,
-        "settled": np.maximum(3 * b.settled, 2.5 * JUMP * sigma),
+        "settled": 1.25 * b.settled,
         "drift_step": np.where(np.isfinite(b.jump), 0.6 * b.jump, b.settled),
         "step": _refused_steps(t),
         "rest": _place_of_rest(t, 3 * b.settled),
-        "per_unit": per_unit,
-        "shift": 2.5 * JUMP * sigma * per_unit,
-        "astray": 3 * b.range * per_unit,
+        "shift": 1.5 * JUMP * sigma,
+        "astray": 3 * b.range,
         "coil": currents,
         "sum": [1e6],
+        "factor": [3.0],
         "observed": [2 * float(np.max(np.where(np.isfinite(limits), limits, 100.0)))],
     }
     if c.tracks == "errors" and not c.Ki.any():  # the sums are among its states
@@ -263,7 +275,6 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
         numbers |= {
             "current": [1.5 * b.current],
             "offset": [3 * b.offset],
-            "uneven": [3 * b.uneven],
             "link": [1.5 * t.believed.drive.link_voltage],
             "astray_current": [0.3 * largest],
             "lost_control": [0.9 * largest],
@@ -284,15 +295,34 @@ def _numbers(values: Iterable[float], t: Target) -> str:
     return c_numbers(np.clip([*values], -1e18, 1e18), t.precision)
 
 
-def _shown_states(t: Target) -> tuple[list[int], FloatArray]:
-    """The state of the filter that each expected reading shows most, and how much of it is a unit of the reading."""
+def _expectation(t: Target) -> dict[str, str]:
+    """How readings depend on the filter's states near zero, states by the readings, and samples of a slow shift."""
     if t.controller.tracks == "errors":
-        return [0] * len(t.controller.measurements), np.ones(len(t.controller.measurements))
+        return {}
     xi = ca.SX.sym("xi", len(t.controller.states))
     slope = ca.Function("slope", [xi], [ca.densify(ca.jacobian(expected_readings(t)(xi), xi))])
     C = np.array(slope(0))
-    seen = np.abs(C).argmax(axis=1)
-    return seen.tolist(), 1 / C[np.arange(len(C)), seen]
+    matrices = {
+        "shows": C,
+        "told": np.linalg.pinv(C, SAME_SHARE),
+        "alone": _states_by_one_reading(C, bounds_of(t).range),
+    }
+    numbers = {"slowly": str(SLOWLY), "slowly_real": c_number(float(SLOWLY), t.precision)}
+    return numbers | {
+        key: ", ".join(f"{{ {_numbers(row, t)} }}" for row in rows) for key, rows in matrices.items()
+    }
+
+
+def _states_by_one_reading(C: FloatArray, ranges: FloatArray) -> FloatArray:
+    """n x p: the change of states by which a reading is one more and the others, by their ranges, the least."""
+    scaled = C / ranges[:, None]
+    columns = []
+    for k, row in enumerate(C):
+        particular = np.linalg.pinv(row[None])[:, 0]  # 0 of a reading that shows no state
+        free = np.eye(C.shape[1]) - np.outer(particular, row)
+        others = np.delete(scaled, k, axis=0)
+        columns.append(particular - free @ np.linalg.pinv(others @ free, SAME_SHARE) @ (others @ particular))
+    return np.column_stack(columns)
 
 
 def _sensors(row: Monitor, t: Target) -> int:
@@ -301,7 +331,9 @@ def _sensors(row: Monitor, t: Target) -> int:
     able = {
         "TOUCH": np.isfinite(b.touch),
         "RATE": np.isfinite(b.jump),
+        "FOLLOWING": np.isfinite(b.touch),
         "INNOVATION": np.isfinite(b.sigma),
+        "STROKE": np.arange(len(b.sigma)) == (t.believed.stroke_output if t.believed.has_stroke else -1),
         "STUCK": np.array(b.stuck) < ENDLESS_SAMPLES,
     }
     mask = able.get(row.key, np.ones(len(b.range), dtype=bool))
@@ -317,7 +349,7 @@ def _unreached_states(row: Monitor, t: Target) -> int:
 
 def _tried_states(row: Monitor, t: Target) -> set[State]:
     """The states in which a fault makes a row act."""
-    return set(row.states) - {one.state for one in out_of_reach(t) if one.key == row.key}
+    return set(row.states) - {"WIRING"} - {one.state for one in out_of_reach(t) if one.key == row.key}
 
 
 def _unreached_lines(t: Target) -> list[str]:
@@ -435,11 +467,15 @@ OTHER_STATES = {key: tuple(state for state in IN_USE if state != key) for key in
 # (monitors, states, why they cannot hurt or do not count there); OFF and FAULT have their gates off
 UNWATCHED_STATES: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
     (("TOUCH",), GROUND, "the machine rests on its bearing"),
-    (("TOUCH",), ("LIFT", "LANDING"), "the machine leaves its bearing, or goes to it"),
+    (("FOLLOWING",), GROUND, "nothing is followed"),
     (("RANGE", "STUCK", "STALE", "NAN"), ("OFFSETS",), "positions are not used yet"),
     (("RATE",), GROUND, "the first readings come from anywhere, and nothing moves"),
-    (("INNOVATION", "UNBELIEVED", "BLIND", "ASTRAY"), GROUND, "the filter does not run"),
-    (("INNOVATION",), ("LIFT", "SETTLE", "LANDING"), "a bearing pushes; ASTRAY and UNSETTLED watch"),
+    (("INNOVATION", "STROKE", "UNBELIEVED", "BLIND", "ASTRAY"), GROUND, "the filter does not run"),
+    (
+        ("INNOVATION",),
+        ("LIFT", "SETTLE", "LANDING"),
+        "a bearing pushes; FOLLOWING, ASTRAY and UNSETTLED watch",
+    ),
     (("HELPLESS", "SATURATION"), GROUND, "no force acts"),
     (("SATURATION",), ("LIFT",), "lift-off ends after its time, and SETTLE watches"),
     (("SATURATION", "LINK"), ("LANDING",), "it lands already; HELPLESS watches"),
@@ -455,6 +491,18 @@ UNWATCHED_STATES: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
 )
 
 
+def transition_lines(t: Target) -> list[str]:
+    """The table of transitions as lines of Markdown: states, event, next state; those of one event and end in one line.
+
+    transition_lines(Target(malta.gains.read("design/gains/robust.json")))[2]
+    """
+    found: dict[tuple[str, str], list[str]] = {}
+    for begin, on, end in transitions_of(wiring=t.wiring):
+        found.setdefault((on, end), []).append(begin)
+    rows = [f"| {', '.join(begins)} | {on.lower()} | {end} |" for (on, end), begins in found.items()]
+    return ["| from | by | to |", "|---|---|---|", *rows]
+
+
 def watch_table(t: Target) -> dict[str, dict[State, str]]:
     """The reactions of each monitor in each state, as "hold, land", or in brackets why it does not count there.
 
@@ -462,13 +510,19 @@ def watch_table(t: Target) -> dict[str, dict[State, str]]:
     """
     table: dict[str, dict[State, str]] = {}
     for row in monitors_of(t):
-        cells = table.setdefault(row.key, dict.fromkeys(STATES, ""))
+        cells = table.setdefault(row.key, dict.fromkeys(states_of(t), ""))
         for state in row.states:
             cells[state] = ", ".join(filter(None, [cells[state], row.reaction.lower()]))
     for key, cells in table.items():
         for state in STATES:
             if state not in IN_USE:
                 cells[state] = "(gates are off)"
+        if key == "WIRING":
+            cells |= dict.fromkeys(IN_USE, "(the wiring is tried once, before the first lift-off)")
+        elif t.wiring:
+            cells["WIRING"] = (
+                cells["WIRING"] or "(small voltages on a machine that rests; WIRING looks at the answers)"
+            )
         for keys, states, reason in UNWATCHED_STATES:
             for state in states if key in keys else ():
                 cells[state] = cells[state] or f"({reason})"
@@ -478,13 +532,14 @@ def watch_table(t: Target) -> dict[str, dict[State, str]]:
 def watch_lines(t: Target) -> list[str]:
     """The table in Markdown: monitors down, the states that are not off across; reasons are numbered below it."""
     reasons: list[str] = []
+    used: tuple[State, ...] = (*IN_USE, "WIRING") if t.wiring else IN_USE
     lines = [
-        "| monitor | " + " | ".join(state.lower() for state in IN_USE) + " |",
-        "|---" * (1 + len(IN_USE)) + "|",
+        "| monitor | " + " | ".join(state.lower() for state in used) + " |",
+        "|---" * (1 + len(used)) + "|",
     ]
     for key, cells in watch_table(t).items():
         shown = []
-        for state in IN_USE:
+        for state in used:
             text = cells[state]
             if text.startswith("("):
                 if text not in reasons:

@@ -69,7 +69,7 @@ def read_mat(data: bytes) -> dict[str, Any]:
         raise ValueError("its header is none of a little-endian MAT-file of level 5")
     found: dict[str, Any] = {}
     room = MAX_DECOMPRESSED_BYTES
-    for kind, content in _elements(memoryview(data)[HEADER:]):
+    for kind, content in mat_elements(memoryview(data)[HEADER:]):
         if kind == COMPRESSED_ELEMENT:
             kind, content = _decompress(content, room)
             room -= len(content)  # never 0, which zlib takes for no limit: the tag is not counted
@@ -82,7 +82,7 @@ def read_mat(data: bytes) -> dict[str, Any]:
     return found
 
 
-def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+def mat_elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
     """(type, content) of each element of some bytes, which end with the last one and its padding."""
     at = 0
     while at < len(data):
@@ -112,7 +112,7 @@ def _decompress(content: memoryview, room: int) -> tuple[int, memoryview]:
         raise ValueError(
             f"a compressed element that is damaged, or of more than {MAX_DECOMPRESSED_BYTES} bytes"
         )
-    parts = _elements(memoryview(plain))
+    parts = mat_elements(memoryview(plain))
     found = next(parts, None)
     if found is None or next(parts, None) is not None:
         raise ValueError("a compressed element that is not one matrix")
@@ -125,7 +125,7 @@ def _matrix(content: memoryview, depth: int) -> tuple[str, Any]:
         return "", np.zeros((0, 0))
     if depth > MAX_STRUCT_DEPTH:
         raise ValueError(f"more than {MAX_STRUCT_DEPTH} structs in structs")
-    parts = _elements(content)
+    parts = mat_elements(content)
     flags = np.frombuffer(_content(parts, UINT32, "flags", 8), "<u4")
     kind = int(flags[0]) & 0xFF
     if int(flags[0]) & 0xFF00:

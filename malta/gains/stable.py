@@ -6,7 +6,6 @@ from pathlib import Path
 
 from malta.files import locate
 from malta.gains.file import read, refuse_unstable
-from malta.loops.own_model import unstable_gain
 from malta.synthesis.controller import Controller
 
 
@@ -21,5 +20,7 @@ def require_held(controller: Controller, path: str | Path) -> Controller:
     Raises InputError for gains of a PID or of a law of errors that do not stabilize the loop on the file's own machine.
     """
     if controller.cost is None:
+        from malta.loops.own_model import unstable_gain  # here: an LQG needs no loop
+
         refuse_unstable(unstable_gain, controller, locate(path), "the loop on the file's own machine")
     return controller

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from malta.display import Description, display
+from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, read_file
 from malta.gains.file import content_of
@@ -26,7 +26,7 @@ from malta.identification.calibration import Interval95, at_rest
 from malta.identification.excite import cut_loop, output_bands
 from malta.identification.learn import FACTORS, learn, own_stroke
 from malta.identification.log import Log, log_of
-from malta.identification.log_files import read_log, write_log
+from malta.identification.log_files import OTHER_SUFFIXES, read_log, write_log
 from malta.identification.measure import measure, plan_measurement
 from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.identification.strokes import stroke_of
@@ -145,6 +145,17 @@ class Commissioning:
         return len(self.entries) == len(self.steps) and all(entry.passed for entry in self.entries)
 
     @property
+    def failed(self) -> JournalEntry | None:
+        """The first step that did not pass; None where all that were gone did."""
+        return next((entry for entry in self.entries if not entry.passed), None)
+
+    @property
+    def left(self) -> tuple[str, ...]:
+        """Steps that were not gone."""
+        gone = {entry.name for entry in self.entries}
+        return tuple(name for name in self.steps if name not in gone)
+
+    @property
     def document(self) -> dict[str, Any]:
         """The journal as JSON holds it, without its signature."""
         entries = [
@@ -176,7 +187,7 @@ class Commissioning:
         rows = (
             ("gain file", f"{self.gains}, sha256 {self.sha256[:16]}"),
             ("steps", ", ".join(states) or "none"),
-            ("left", ", ".join(self.steps[len(self.entries) :]) or "none"),
+            ("left", ", ".join(self.left) or "none"),
             ("signature", self.signature),
         )
         return Description(f"Commissioning of a {self.machine}", rows)
@@ -195,24 +206,33 @@ def commission(
     truth: Plant | None = None,
     errors: Mapping[str, float] | None = None,
     logs: str | Path | None = None,
+    reading: Mapping[str, Any] | None = None,
     steps: Sequence[Check] | None = None,
+    only: Sequence[str] = (),
+    skip: Sequence[str] = (),
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Commissioning:
     """Go through the checklist until a step fails, and write a log for each and the journal.
+
+    Steps that are named alone or left out do not end the day; what the journal has of them, and of steps after one that
+    fails now, stays.
 
     gains : the gain file, whose sha256 is signed
     controller : what it holds
     folder : for logs and journal; steps that passed in it with these gains and logs are kept
     truth : the simulated machine; None: that of the gain file
     errors : of its sensors by name, SI
-    logs : folder of a bench with logs NAME.npz, .csv or .mat of the steps; a step without one waits for it. None: the
-        simulated machine
+    logs : folder of a bench with logs NAME.npz, .csv, .mat or of another suffix of the steps; a step without one waits
+        for it. None: the simulated machine
+    reading : arguments of `read_log`, where other programs wrote the logs
     steps : None: those of the machine
+    only, skip : names of steps that are gone alone, again where they were, and that are left out
     seed : of the noise
     progress : called with the name of each step that begins
 
-    Returns a Commissioning. Raises InputError for a damaged journal, and a folder that cannot be written.
+    Returns a Commissioning. Raises InputError for a damaged journal, a folder that cannot be written, and a name that
+    no step has.
 
         commission("design/gains/robust.json", controller, "build/day")
     """
@@ -228,21 +248,27 @@ def commission(
     entries: list[JournalEntry] = []
     kept: list[str] = []
     done = Commissioning(str(path), digest, plant.name, simulated, (), tuple(step.name for step in list_of))
-    before = {} if logs else _entries_before(folder, done)
+    for option, names in (("--step", only), ("--skip", skip)):
+        for name in names:
+            if name not in done.steps:
+                raise InputError(option, "", repr(name), f"one of {' '.join(done.steps)}")
+    before = {} if logs and not (only or skip) else _entries_before(folder, done)
     for step in list_of:
-        entry = before.get(step.name)
-        if entry is None:
+        entry, wanted = before.get(step.name), step.name in (only or done.steps) and step.name not in skip
+        wanted = wanted and done.failed is None
+        if entry is None and not wanted:
+            continue
+        if entry is None or (wanted and (only or logs)):
             if progress is not None:
                 progress(step.name)
-            entry = _take_step(step, bench, folder, None if logs is None else Path(logs))
+            read = partial(read_log, **(reading or {}))
+            entry = _take_step(step, bench, folder, None if logs is None else Path(logs), read)
         else:
             kept.append(step.name)
         entries.append(entry)
         done = replace(done, entries=tuple(entries), kept=tuple(kept))
         content = json_text(done.document | {"signature": done.signature})
         replace_files({folder / JOURNAL: content.encode()})
-        if not entry.passed:
-            break
     return done
 
 
@@ -253,19 +279,21 @@ def steps_of(plant: Plant, box: Mapping[str, float]) -> tuple[Check, ...]:
     return general_steps(plant, box) if own is None else own(box)
 
 
-def _take_step(step: Check, bench: Bench, folder: Path, logs: Path | None) -> JournalEntry:
+def _take_step(
+    step: Check, bench: Bench, folder: Path, logs: Path | None, read: Callable[[Path], Log]
+) -> JournalEntry:
     """Record or read the log of a step, and judge it."""
     try:
         if logs is None:
             path = write_log(step.record(bench), folder / f"{step.name}.npz")
         else:
-            found = [logs / f"{step.name}{suffix}" for suffix in (".npz", ".csv", ".mat")]
+            found = [logs / f"{step.name}{suffix}" for suffix in (".npz", ".csv", ".mat", *OTHER_SUFFIXES)]
             path = next((file for file in found if file.exists()), found[0])
             if not path.exists():
                 return JournalEntry(
                     step.name, step.question, str(path), "", (), f"waits for {path}: {step.needs}"
                 )
-        log = read_log(path)
+        log = read_log(path) if logs is None else read(path)
     except CheckError as error:
         return JournalEntry(step.name, step.question, "", "", (), str(error))
     try:
@@ -332,10 +360,15 @@ def read_journal(path: Path) -> tuple[Commissioning, str]:
 
 def _finding_of(table: Mapping[str, Any]) -> StepFinding:
     ends = {"low": -math.inf, "high": math.inf} | {
-        k: float(table[k]) for k in ("low", "high") if table[k] is not None
+        k: _number_of(table[k]) for k in ("low", "high") if table[k] is not None
     }
-    value, half = (math.nan if table[k] is None else float(table[k]) for k in ("value", "half"))
+    value, half = (math.nan if table[k] is None else _number_of(table[k]) for k in ("value", "half"))
     return StepFinding(str(table["name"]), Interval95(value, half, str(table["unit"])), **ends)
+
+
+def _number_of(entry: Any) -> float:
+    """A number as it is written: a whole one stays whole, since the signature is of its text."""
+    return entry if isinstance(entry, int) and abs(float(entry)) < math.inf else float(entry)
 
 
 def fly(bench: Bench, scenario: Scenario, *, ends: Iterable[str] = ENDS) -> Log:
@@ -355,7 +388,7 @@ def general_steps(plant: Plant, box: Mapping[str, float]) -> tuple[Check, ...]:
         "still", "Do the sensors read as quietly as the filter believes?", "the mover held at its place",
         "touchdown", _record_still, judge_noise,
     )  # fmt: skip
-    steps = (noise, noise_step(), loop_step(box))
+    steps = (noise, noise_step(plant=plant), loop_step(box))
     return (*steps, stroke_step()) if plant.has_stroke else steps
 
 
@@ -364,11 +397,18 @@ def record_noise(bench: Bench) -> Log:
     return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
 
 
-def noise_step(record: Callable[[Bench], Log] = record_noise) -> Check:
-    """The step that measures the noise of the current sensors, and what it makes of the forces."""
+def noise_step(record: Callable[[Bench], Log] = record_noise, plant: Plant | None = None) -> Check:
+    """The step that measures the noise of the current sensors, and what it makes of the forces.
+
+    plant : without windings, a tenth of what its coils may have flows; None: 1 A
+    """
+    flows, most, where = "1 A", "a current above 2 A", "phase"
+    if plant is not None and plant.actuator.windings is None and plant.actuator.coils:
+        limit, unit = plant.actuator.current_limit, plant.actuator.coils[0].unit
+        flows, most, where = quantity(limit / 10, unit), f"more than {quantity(limit / 5, unit)}", "coil"
     return Check(
-        "noise", "What noise do the currents make of the forces?", "mover out or clamped, 1 A dc in each phase",
-        "a current above 2 A", record, judge_currents,
+        "noise", "What noise do the currents make of the forces?",
+        f"mover out or clamped, {flows} dc in each {where}", most, record, judge_currents,
     )  # fmt: skip
 
 
@@ -380,9 +420,12 @@ def judge_currents(controller: Controller, log: Log) -> list[StepFinding]:
     found = process_noise(plant_of(controller.parameters), log)
     if found:
         return [StepFinding(f"noise of {name}", e) for name, e in found.items()]
-    own = 0.0 if controller.noise is None else float(np.sqrt(controller.noise.process.max()))
     what = "no current sensors: the largest process noise that the gain file has"
-    return [StepFinding(what, Interval95(own, 0.0))]
+    if controller.noise is None:
+        return [StepFinding(what, Interval95(0.0, 0.0))]
+    force = int(controller.noise.process.argmax())
+    own = float(np.sqrt(controller.noise.process[force]))
+    return [StepFinding(what, Interval95(own, 0.0, controller.forces[force].unit))]
 
 
 def noise_of_design(done: Commissioning, controller: Controller) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arguments import describe
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError
@@ -61,6 +62,7 @@ class ExcitationPlan:
     current : by measured current: largest deviation from the current at rest, A
     command : by input: the largest command, with the one that holds the machine, as a share of its limit
     accuracy : by parameter: half of the 95 % interval that the log will give, as a share of its value
+    unit : of the currents, V where voltages are the commands
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -77,6 +79,7 @@ class ExcitationPlan:
     current: Mapping[str, float]
     command: Mapping[str, float]
     accuracy: Mapping[str, float]
+    unit: str = "A"
 
     @property
     def duration(self) -> float:
@@ -91,7 +94,7 @@ class ExcitationPlan:
             ("lines", f"{len(f)} from {f[0]:g} to {f[-1]:g} Hz, period {self.signal.period:g} s"),
             ("crest factor", f"{np.nanmin(crest):.2f} .. {np.nanmax(crest):.2f}"),
             ("motion", ", ".join(f"{name} {value:.3g}" for name, value in self.motion.items())),
-            ("current", f"{quantity(max(self.current.values()), 'A')} at most beside that at rest"),
+            ("current", f"{quantity(max(self.current.values()), self.unit)} at most beside that at rest"),
             ("command", f"{100 * max(self.command.values()):.3g} % of a limit at most"),
         ]
         rows += [(name, f"+-{100 * share:.2g} %") for name, share in self.accuracy.items()]
@@ -122,7 +125,8 @@ def excite(
     force : largest force of each input, N or N m
     current : largest current beside the one at rest, A; where no size is given 10 % of its limit, and commands within
         half of the force limits, and what the machine's curvature adds at the lines within 100 deviations of the noise
-    motion : largest deviation of any output, m or rad; of several limits the strictest counts
+    motion : largest deviation of any output in m or rad, or of any at all where all have one unit, SI; of several
+        limits the strictest counts
     period : s; None: by the band
     periods : that are logged
     band : Hz, lowest and highest line; None: by the loop
@@ -133,8 +137,8 @@ def excite(
 
     Returns an ExcitationPlan.
 
-    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, and an
-    unstable loop. A machine without limits is refused where no size is given.
+    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, a motion of
+    a machine with none, and an unstable loop. A machine without limits is refused where no size is given.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -143,6 +147,10 @@ def excite(
     >>> f"{1e6 * max(plan.motion.values()):.1f} um, K_A to {plan.accuracy['K_A']:.2%}"
     '10.0 um, K_A to 0.13%'
     """
+    from malta.loops.loop import Loop
+
+    if not isinstance(loop, Loop):
+        raise InputError("excite", "loop", describe(loop), "a Loop, as malta.loop(plant, controller) gives")
     plant, m = loop.plant, len(loop.plant.inputs)
     given = {"force": force, "current": current, "motion": motion, "period": period}
     band = _require(loop, given, {"periods": periods, "lines": lines}, band)
@@ -164,7 +172,8 @@ def excite(
         current = CURRENT * plant.actuator.current_limit
         room = COMMAND * limit - np.minimum(np.abs(np.asarray(_rest_point(loop).v)), COMMAND / 2 * limit)
         limits = [(found.v / room, 1.0)]
-    sizes = ((found.i, current), (found.y, motion))
+    moved = slice(None) if motion is None else _moving_outputs(plant)
+    sizes = ((found.i, current), (found.y[:, moved], motion))
     limits += [(part, most) for part, most in sizes if most is not None and np.isfinite(most)]
     for spectrum, most in limits:  # each input alone, then all together
         share = np.minimum(share, most / np.maximum(_peaks(unit, spectrum).max(axis=1), 1e-300))
@@ -179,6 +188,16 @@ def excite(
         share = 0.8 * share
     signal = replace(unit, amplitude=unit.amplitude * share[axis])
     return _plan(loop, model, signal, periods, found.times(share[axis]), named=bool(parameters))
+
+
+def _moving_outputs(plant: Plant) -> list[int]:
+    """The outputs that a motion bounds: those in m or rad; all of one unit. Raises InputError for others."""
+    units = dict.fromkeys(s.unit for s in plant.outputs)
+    moved = [k for k, s in enumerate(plant.outputs) if len(units) == 1 or s.unit in ("m", "rad")]
+    if not moved:
+        expected = "outputs in m or rad, or all in one unit; else a force or a current"
+        raise InputError("excite", "motion", f"a machine with outputs in {', '.join(units)}", expected)
+    return moved
 
 
 class Cut(NamedTuple):
@@ -240,12 +259,12 @@ def default_band(loop: Loop) -> tuple[float, float]:
 
 
 def output_bands(loop: Loop) -> FloatArray:
-    """By output: the highest frequency at which |T| = 0.7, the others closed, Hz; the lowest that is looked at where it
-    never is."""
+    """By output: the highest frequency with |T| = 0.7, the others closed, Hz; of a peak below 1: with 0.7 of that."""
     w = np.geomspace(MIN_SHARE, 1.0, GRID) * np.pi / loop.sample_time
     S = cut_loop(loop, w).S
-    wide = np.abs(1 - np.einsum("kpp->kp", S)) >= np.sqrt(0.5)
-    last = np.where(wide.any(axis=0), len(w) - 1 - wide[::-1].argmax(axis=0), 0)
+    T = np.abs(1 - np.einsum("kpp->kp", S))
+    wide = np.sqrt(0.5) * np.minimum(1.0, T.max(axis=0)) <= T
+    last = len(w) - 1 - wide[::-1].argmax(axis=0)
     return np.asarray(w[last] / (2 * np.pi))
 
 
@@ -344,6 +363,7 @@ def _plan(
         current=dict(zip(model.currents, _together(signal, found.i).tolist(), strict=True)),
         command=dict(zip(inputs, most.tolist(), strict=True)),
         accuracy={model.names[k]: 1.96 * float(s) for k, s in zip(chosen, sigma, strict=True)},
+        unit=axes_of(plant)[0].unit,
     )
 
 

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from itertools import combinations
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.special import gammainccinv, gammaincinv
+from scipy.special import gammainccinv
 
 from malta.arrays import ComplexArray, FloatArray
-from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, require_currents
+from malta.identification.checks import check_loop, outside_of_box
+from malta.identification.explanation import explain
+from malta.identification.identified import Identified
+from malta.identification.imperfections import bench_units, usual_size
+from malta.identification.log import Log, last_rows, require_currents
 from malta.identification.prediction import Predicted, predict
 from malta.identification.response import (
     STEP,
@@ -31,20 +35,20 @@ from malta.identification.response import (
     units_of_model,
     well_found,
 )
+from malta.identification.signal_checks import driven_currents, require_signals
 from malta.identification.spectra import (
     SIGMA,
-    Explained,
     Spectrum,
     between_neighbours,
     distortion_of,
     explained_at_lines,
     in_axes,
+    missing_shares,
     noise_of,
     readings,
     require_closed_loop,
     require_log,
     residuals_of,
-    sentence_of,
     spectrum_of,
     straighten,
     weights_of,
@@ -53,9 +57,11 @@ from malta.identification.spectra import (
     whole,
     windowed_covariances,
 )
+from malta.identification.unmodelled import residual_bound
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
+from malta.work import is_stopped
 
 IntArray = NDArray[np.integer[Any]]
 
@@ -64,148 +70,22 @@ SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by
 LOST_SHARE = 1.0  # of its value: a combination of parameters that is found worse is not found
 MIN_PROBABILITY = 1e-6  # probability below which chi2 refuses the model
 SLACK = 1.1  # factor of chi2: the noise's covariance is estimated too
-MAX_LINE_CORRELATION = 5.0  # standard deviations of the correlation between neighbouring lines
 MAX_STRAIGHTENINGS = 12  # estimates at most, each with the curvature and the weights of the one before
 SETTLED_STEP = 0.01  # standard deviations: what moves by less is settled
-MAX_ESTIMATE_DISTANCE = 3.0  # standard deviations between the estimates at the lines and in time
-ESTIMATE_ACCURACY = 3e-5  # of a value: to which estimates on a right model are computed
+MAX_BEYOND = 3.0  # standard deviations, by which noise may take a parameter beyond its limit
+MEASURED = 0.4  # times its usual size: what is known otherwise, where no interval is given
+MAX_APART = 0.01  # of a value, by which two logs of one machine may differ in it, and
+MAX_DEVIATIONS_APART = 6.0  # standard deviations, each with what its own log leaves
 MIN_LINE_POWER = 4.0  # over the noise, of the output that moves most: below, nothing was excited
-
-
-@display
-@dataclass(frozen=True, eq=False)
-class Identified:
-    """Parameters that were identified from a log.
-
-    log : from which
-    plant : the machine with these parameters
-    names : of the parameters
-    values : SI
-    start : SI, with which the search began: those of the gain file
-    covariance : of the values, SI
-    held : parameters that act too and were taken as known, SI
-    chi2 : of the residuals at the lines over their degrees of freedom; 1 where the model is right
-    limit : of chi2 over its degrees of freedom, above which the model is refused
-    dof : degrees of freedom
-    whiteness : correlation of neighbouring lines' residuals in standard deviations
-    distortion : power at multiples of 1 / period that were not excited, over the noise; 1 of a linear machine
-    by_output : chi2 of each output
-    dropped : parameters that this log does not determine by themselves, with their standard deviation as a share
-    in_time : the same parameters from prediction errors in time; None where the machine's sensors lag, or its states
-        are not (q, q')
-    explained : where chi2 is above its limit: what a change of each parameter that was taken as known would explain, as
-        shares of its value and of chi2
-
-    >>> import dataclasses, malta
-    >>> controller = malta.gains.read("design/gains/robust.json")
-    >>> plant = malta.plant_of(controller.parameters)
-    >>> loop = malta.loop(plant, controller)
-    >>> plan = malta.excite(loop, period=0.5, periods=4, band=(4, 400))
-    >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
-    >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
-    >>> run = malta.simulate(true, controller, excited)
-    >>> found = malta.identify(
-    ...     controller, malta.identification.log_of(run), parameters=["K_A", "K_B"]
-    ... )
-    >>> found.names, len(found.intervals["K_A"])
-    (('K_A', 'K_B'), 2)
-    """
-
-    log: Log
-    plant: Plant
-    names: tuple[str, ...]
-    values: FloatArray
-    start: FloatArray
-    covariance: FloatArray
-    held: Mapping[str, float]
-    chi2: float
-    limit: float
-    dof: int
-    whiteness: float
-    distortion: float
-    by_output: Mapping[str, float]
-    dropped: Mapping[str, float]
-    in_time: Predicted | None = None
-    explained: Explained = field(default_factory=dict)
-
-    @property
-    def half_widths(self) -> FloatArray:
-        """Half of each 95 % interval, SI."""
-        return np.asarray(SIGMA * np.sqrt(np.diag(self.covariance)))
-
-    @property
-    def intervals(self) -> dict[str, tuple[float, float]]:
-        """The 95 % interval of each parameter, SI."""
-        low, high = self.values - self.half_widths, self.values + self.half_widths
-        return dict(zip(self.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
-
-    @property
-    def correlation(self) -> FloatArray:
-        """Of the values."""
-        sigma = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(sigma, sigma))
-
-    @property
-    def joint(self) -> float:
-        """By how much the box of the intervals grows until it holds the 95 % ellipsoid of all parameters together."""
-        return float(np.sqrt(2 * gammaincinv(len(self.names) / 2, 0.95)) / SIGMA)
-
-    @property
-    def differences(self) -> dict[str, float]:
-        """By parameter: the estimate in time less that at the lines, in standard deviations of the larger one.
-
-        Both use the same readings, so that right models differ by much less than the deviation of either. What either
-        computes to counts as a deviation too: a part of the curvature, and of motion between samples, is left.
-        """
-        if self.in_time is None:
-            return {}
-        variance = np.maximum(np.diag(self.covariance), np.diag(self.in_time.covariance))
-        off = (self.in_time.values - self.values) / np.sqrt(variance + (ESTIMATE_ACCURACY * self.values) ** 2)
-        return dict(zip(self.names, off.tolist(), strict=True))
-
-    @property
-    def refusal(self) -> str:
-        """Why the model does not explain the log; "": it does."""
-        worst = max(self.by_output, key=lambda name: self.by_output[name])
-        if self.chi2 > self.limit:
-            return (
-                f"chi2 / dof is {self.chi2:.3g}, at most {self.limit:.3g} is noise: the machine's model does not "
-                f"explain the log, {worst} least ({self.by_output[worst]:.3g}){sentence_of(self.explained)}"
-            )
-        if abs(self.whiteness) > MAX_LINE_CORRELATION:
-            return (
-                f"residuals of neighbouring lines are correlated by {self.whiteness:.1f} standard deviations, at "
-                f"most {MAX_LINE_CORRELATION:g} is noise: the machine's model lacks something"
-            )
-        if self.differences and self.in_time is not None:
-            name, off = max(self.differences.items(), key=lambda item: abs(item[1]))
-            k = self.names.index(name)
-            if abs(off) > MAX_ESTIMATE_DISTANCE:
-                return (
-                    f"{name} is {self.values[k]:.5g} at the lines and {self.in_time.values[k]:.5g} in time, "
-                    f"{abs(off):.1f} standard deviations apart, at most {MAX_ESTIMATE_DISTANCE:g} is noise: the model "
-                    "lacks something"
-                )
-        return ""
-
-    @property
-    def description(self) -> Description:
-        """The values with their intervals, and how well they explain the log."""
-        units = units_of_model(self.plant)
-        rows = [
-            (name, f"{value:.5g} +- {half:.2g} {units[name]}")
-            for name, value, half in zip(self.names, self.values, self.half_widths, strict=True)
-        ]
-        rows.append(("chi2 / dof", f"{self.chi2:.3f} of {self.dof}, at most {self.limit:.3f}"))
-        return Description(f"Identified from {self.log.source!r}", tuple(rows))
 
 
 def identify(
     controller: Controller,
-    log: Log,
+    log: Log | Sequence[Log],
     *,
     parameters: Sequence[str] = (),
-    known: Mapping[str, float] | None = None,
+    box: Mapping[str, float] | None = None,
+    known: Mapping[str, Known] | None = None,
     start: Mapping[str, float] | None = None,
     robust: bool = False,
     in_time: bool = True,
@@ -226,11 +106,19 @@ def identify(
     process noise that is found between the lines. Both are reported; a model that lacks something makes them differ.
     A machine whose sensors lag, or whose states are not (q, q'), is estimated at the lines alone.
 
+    Last, everything that was taken as known, and the imperfections of any bench, are estimated beside the parameters,
+    each with its usual size as a prior (`malta.identification.explanation`). That gives total intervals; where the
+    parameters alone do not explain the log, it also gives their values, and what explains the rest. The loop of the
+    identified machine is compared with S as the log has it.
+
     controller : the gain file that was running; its machine's parameters are where the search starts
-    log : with measured currents and an excitation of whole periods
+    log : with measured currents and an excitation of whole periods; or several of the same machine, each at its own
+        place, with its own noise, which are estimated together at the lines
     parameters : names of the machine's record or of its sensors' errors; (): those that the log determines to 50 %,
         but for masses and lengths, which are held
-    known : parameters with values that were weighed or measured otherwise, SI
+    box : shares by which parameters of the gain file may vary: a parameter outside is refused, and where none is named
+        those of the box are identified that the log determines to 50 %
+    known : parameters with values that were weighed or measured otherwise, SI; or (value, half of its 95 % interval)
     start : values from which the search starts, SI
     robust : take outliers among the readings for missing, with Student's likelihood in time
     in_time : whether to estimate in time too, where the estimate at the lines is not refused
@@ -239,7 +127,8 @@ def identify(
 
     Returns an Identified, also where its `refusal` says that the model does not explain the log.
 
-    Raises InputError for unknown parameters and another machine's signals; CheckError for a log that tells nothing:
+    Raises InputError for unknown parameters, another machine's signals, and logs of different currents. Raises
+    CheckError for logs that do not fit together, and for a log that tells nothing:
     too short, without excitation or with one that is not independent, an open loop, another sample time, a stuck or
     clipped sensor, parameters that only act together.
 
@@ -257,27 +146,131 @@ def identify(
     >>> found.refusal, bool(abs(found.values[0] - 9000) < 20)
     ('', True)
     """
-    plant = _known_plant(plant_of(controller.parameters), known or {}, start or {})
-    log = in_axes(log, plant)
-    _require_machine(controller, plant, log)
-    y, i = readings(log, robust=robust), whole(log, "i")
-    names = require_parameters(plant, parameters) or candidates(plant)
-    names = tuple(name for name in names if name not in (known or {}))
-    records, dropped = _choose([_record(plant, names, log, y, i)], log.source, named=bool(parameters))
-    model, spectrum, _ = records[0]
-    found = _estimate_straightened(records, log, dropped)
-    filled = robust or bool(np.isnan(y).any())
-    wanted = filled or (in_time and not found.refusal)
-    if not wanted or plant.sensors.late or not plant.second_order:
-        return found
+    controller = given_law("identify", controller)
+    own = plant_of(controller.parameters)
+    values, sizes = known_values(own, known or {})
+    plant, box = known_plant(own, values, start or {}), dict(box or {})
+    logs = [in_axes(one, plant) for one in ([log] if isinstance(log, Log) else log)]
+    if not logs or (robust and len(logs) > 1):
+        raise InputError("identify", "log", f"{len(logs)} logs", "one log" if logs else "at least one log")
+    for one in logs:
+        require_machine(controller, plant, one)
+    signals = [(whole(one, "i"), readings(one, robust=robust)) for one in logs]
+    log = _join_logs(logs)
+    asked = parameters or tuple(name for name in box if name in units_of_model(plant))
+    names = require_parameters(plant, asked) or candidates(plant)
+    names = tuple(name for name in names if name not in values)
+    made = [_record(plant, names, one, y, i) for one, (i, y) in zip(logs, signals, strict=True)]
+    records, dropped = _choose(made, log.source, named=bool(parameters))
+    found, model = _estimate_straightened(records, log, dropped), records[0].model
+    _require_same_machine(records, logs, found)
+    filled = robust or bool(missing_shares(log, "y", signals[0][1]).any())
+    wanted = len(logs) == 1 and (filled or (in_time and found.chi2 <= found.limit))
+    if wanted and not is_stopped() and not (plant.sensors.late or not plant.second_order or model.lag_named):
+        found, records = _estimate_twice(records, found, signals[0], dropped, robust=robust)
+    found = _with_everything_else(records, found, sizes)
+    at = dict(zip(found.names, found.values.tolist(), strict=True))
+    return replace(
+        found,
+        loop=check_loop(controller, found.plant, *logs),
+        outside=outside_of_box(at, box, own.parameters),
+    )
+
+
+def _join_logs(logs: Sequence[Log]) -> Log:
+    """The first log, under the names of all of them."""
+    if len(logs) == 1:
+        return logs[0]
+    names = dict.fromkeys(s for log in logs for s in [log.source])
+    return replace(logs[0], source=", ".join(names), sha256=" ".join(log.sha256 for log in logs).strip())
+
+
+def _require_same_machine(records: Sequence[_Record], logs: Sequence[Log], found: Identified) -> None:
+    """Raise for logs of different currents, and for those whose own parameters lie apart."""
+    first = records[0].model.currents
+    for r in records:
+        if r.model.currents != first:
+            expected = f"{' '.join(first)}, as {records[0].spectrum.source} has"
+            raise InputError(r.spectrum.source, "i", " ".join(r.model.currents), expected)
+    if len(records) == 1 or found.chi2 <= found.limit or is_stopped():
+        return
+    own = [_estimate_straightened([r], log, {}) for r, log in zip(records, logs, strict=True)]
+    for a, b in combinations(own, 2):
+        off = np.abs(a.values - b.values)
+        sizes = off / np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
+        far = np.where(off > MAX_APART * np.abs(found.values), sizes, 0.0)
+        k = int(far.argmax())
+        if far[k] > MAX_DEVIATIONS_APART:
+            raise CheckError(
+                f"{a.log.source} and {b.log.source} do not fit together: {found.names[k]} is {a.values[k]:.5g} by one "
+                f"and {b.values[k]:.5g} by the other, {far[k]:.2g} standard deviations apart: the machine changed "
+                "between them, or one is of another machine"
+            )
+
+
+def _estimate_twice(
+    records: list[_Record],
+    found: Identified,
+    signals: tuple[FloatArray, FloatArray],
+    dropped: Mapping[str, float],
+    *,
+    robust: bool,
+) -> tuple[Identified, list[_Record]]:
+    """The estimate in time too; where readings are missing, that at the lines again with predictions in their place.
+
+    signals : currents and readings
+    """
+    (i, y), (model, spectrum, _), log = signals, records[0], found.log
     predicted = _estimate_in_time(model, spectrum, found, i, y, robust=robust)
+    filled = robust or bool(missing_shares(log, "y", y).any())
     if filled:  # once more, with predictions in their place
         spectrum = spectrum_of(log, predicted.readings, i)
-        found = _estimate_straightened([records[0]._replace(spectrum=spectrum)], log, dropped)
-        told = float(np.isfinite(y).mean())  # what was filled in tells nothing
+        records = [records[0]._replace(spectrum=spectrum)]
+        found = _estimate_straightened(records, log, dropped)
+        told = 1 - float(missing_shares(log, "y", y).mean())  # what was filled in tells nothing
         found = replace(found, covariance=found.covariance / told)
         predicted = _estimate_in_time(model, spectrum, found, i, y, robust=robust)
-    return replace(found, in_time=predicted)
+    return replace(found, in_time=predicted), records
+
+
+Known = float | tuple[float, float]
+"""A value, or a value and half of its 95 % interval, SI."""
+
+
+def known_values(
+    plant: Plant, known: Mapping[str, Known]
+) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Values of the machine's parameters; and values and standard deviations of all that is known, SI.
+
+    A deviation is that of an interval, else so much less than that of a data file's value.
+    """
+    values = {name: one[0] if isinstance(one, tuple) else float(one) for name, one in known.items()}
+    bench = bench_units(plant)
+    own = {name: value for name, value in values.items() if name not in bench}
+    believed = known_plant(plant, own, {})
+    sizes = {
+        name: one[1] / SIGMA
+        if isinstance(one, tuple)
+        else 0.0
+        if name in bench
+        else MEASURED * usual_size(believed, name)
+        for name, one in known.items()
+    }
+    return own, {name: (values[name], size) for name, size in sizes.items()}
+
+
+def _with_everything_else(
+    records: Sequence[_Record], found: Identified, known: Mapping[str, tuple[float, float]]
+) -> Identified:
+    """What was found, with everything else uncertain; where the parameters alone do not explain the log, all of it."""
+    parts = [(r.model, r.spectrum, r.added) for r in records]
+    e = explain(parts, found.values, known, found.limit, refine=found.chi2 > found.limit and not is_stopped())
+    found = replace(found, explanation=e)
+    if found.chi2 > found.limit:
+        plant = machine_of(records[0].model, e.values, e.covariance, found.log.source)
+        found = replace(found, plant=plant, values=e.values, covariance=e.alone)
+    left = residual_bound([(r.model, r.spectrum, r.at(found.values)) for r in records])
+    return replace(found, unmodelled=left)
 
 
 def weigh(
@@ -287,7 +280,7 @@ def weigh(
     added: Mapping[str, float],
     *,
     parameters: Sequence[str] = (),
-    known: Mapping[str, float] | None = None,
+    known: Mapping[str, Known] | None = None,
 ) -> Identified:
     """Identify parameters from two logs of a machine, with and without a known mass on it: so its own mass comes out.
 
@@ -311,22 +304,24 @@ def weigh(
     >>> malta.identification.weigh.__annotations__["return"]
     'Identified'
     """
-    plant = _known_plant(plant_of(controller.parameters), known or {}, {})
+    controller = given_law("weigh", controller)
+    values, sizes = known_values(plant_of(controller.parameters), known or {})
+    plant = known_plant(plant_of(controller.parameters), values, {})
     require_parameters(plant, list(added))
     if not any(added.values()):
         raise InputError("weigh", "added", "nothing", "what the second log's machine has more, as m=100g")
     names = require_parameters(plant, parameters) or (*candidates(plant), *added)
-    names = tuple(name for name in dict.fromkeys(names) if name not in (known or {}))
+    names = tuple(name for name in dict.fromkeys(names) if name not in values)
     par = plant.parameters
     heavier = plant_with(plant, {name: float(getattr(par, name)) + more for name, more in added.items()})
     records = []
     for flown, machine in ((in_axes(log, plant), plant), (in_axes(loaded, plant), heavier)):
-        _require_machine(controller, machine, flown)
+        require_machine(controller, machine, flown)
         records.append(_record(machine, names, flown, readings(flown, robust=False), whole(flown, "i")))
     records[1] = records[1]._replace(added=added)
     source = f"{log.source} and {loaded.source}"
     records, dropped = _choose(records, source, named=bool(parameters))
-    return _estimate_straightened(records, log, dropped)
+    return _with_everything_else(records, _estimate_straightened(records, log, dropped), sizes)
 
 
 class _Record(NamedTuple):
@@ -346,7 +341,7 @@ def _record(plant: Plant, names: tuple[str, ...], log: Log, y: FloatArray, i: Fl
     """The record of a log. Raises CheckError for a log that tells nothing."""
     s = spectrum_of(log, between_neighbours(y), i)
     mean = s.outputs[0].real, s.currents[0].real
-    around = points_of_noise(i[len(i) - round(2 * np.pi / (s.rate * log.sample_time)) :], s.periods)
+    around = points_of_noise(last_rows(i, round(2 * np.pi / (s.rate * log.sample_time))), s.periods)
     model = ResponseModel(plant, names, tuple(log.names("i")), *mean, log.sample_time, around)
     require_closed_loop(log, float(np.linalg.eigvals(model.matrices(model.start)[0]).real.max()))
     return _Record(model, s)
@@ -370,7 +365,7 @@ def _choose(records: list[_Record], source: str, *, named: bool) -> tuple[list[_
         names = tuple(model.names[k] for k in left)
         records = [r._replace(model=replace(r.model, names=names)) for r in records]
         F = F[np.ix_(left, left)]
-    _require_identifiable(records[0].model, F, source)
+    require_identifiable(records[0].model, F, source)
     return records, dropped
 
 
@@ -383,7 +378,7 @@ def _estimate_straightened(records: Sequence[_Record], log: Log, dropped: Mappin
         _require_told(straight, found)
         moved = np.abs(found.theta - theta) / np.sqrt(np.diag(found.covariance))
         theta = found.theta
-        if (moved < SETTLED_STEP).all():
+        if (moved < SETTLED_STEP).all() or is_stopped():
             break
     return _estimate(straight, log, dropped, found)
 
@@ -397,7 +392,7 @@ def _estimate_in_time(
     return predict(model, found.values, noise, i, y, source=s.source, robust=robust)
 
 
-def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, float]) -> Plant:
+def known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, float]) -> Plant:
     """The machine with what is known of it."""
     values = {**start, **known}
     require_parameters(plant, list(values))
@@ -406,18 +401,19 @@ def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, f
     return plant_with(plant, values)
 
 
-def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
+def require_machine(controller: Controller, plant: Plant, log: Log) -> None:
     """Raise for a log of another machine, without currents, or whose samples no model fits."""
     require_log(log, plant.name, controller.sample_time)
     log.table("y", [s.name for s in plant.outputs])
     if not log.names("i"):
         raise InputError(log.source, "i", "no measured currents", "a column for each axis, as i_dd1 [A]")
-    require_currents(log, [axis.name for axis in axes_of(plant)])
-    found, Ts = log.survey, controller.sample_time
+    require_currents(log, [axis.name for axis in axes_of(plant)], driven_currents(plant))
+    found, Ts = log, controller.sample_time
     if found.jitter > 0.01 * Ts:
         raise CheckError(
             f"{log.source}: its samples jitter by {found.jitter:.3g} s, more than 1 % of {Ts:g} s"
         )
+    require_signals(controller, plant, log)
 
 
 def _information(model: ResponseModel, s: Spectrum, scale: FloatArray) -> FloatArray:
@@ -434,7 +430,7 @@ def _information(model: ResponseModel, s: Spectrum, scale: FloatArray) -> FloatA
     return information(slopes, s.currents[s.lines], variance)
 
 
-def _require_identifiable(model: ResponseModel, F: FloatArray, source: str) -> None:
+def require_identifiable(model: ResponseModel, F: FloatArray, source: str) -> None:
     """Raise CheckError where parameters are not told, alone or together, and say which combination it is."""
     if not model.names:
         raise CheckError(f"{source}: no parameter is told by this log to 50 %: name some, or excite more")
@@ -516,10 +512,7 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
     others = replace(model, names=tuple(n for n in acting_parameters(plant) if n not in model.names))
     slopes = others.slopes(others.start, s.rate * s.lines)
     held = {n: float(getattr(par, n)) for n, slope in zip(others.names, slopes, strict=True) if slope.any()}
-    try:
-        most_likely = plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True)))
-    except InputError as error:
-        raise CheckError(f"{s.source}: what explains the log best is no machine ({error})") from error
+    most_likely = machine_of(model, theta, covariance, s.source)
     limit = float(SLACK * 2 * gammainccinv(dof / 2, MIN_PROBABILITY) / dof)
     parts = [(r.model, r.spectrum, r.at(theta)) for r in records]
     return Identified(
@@ -539,6 +532,23 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
         dropped=dropped,
         explained=explained_at_lines(parts) if chi2 > limit else {},
     )
+
+
+def machine_of(model: ResponseModel, theta: FloatArray, covariance: FloatArray, source: str) -> Plant:
+    """The machine with parameters; one that noise alone takes beyond its limit is at the limit.
+
+    Raises CheckError where it is none.
+    """
+    values = dict(zip(model.names, theta.tolist(), strict=True))
+    for name, half in zip(model.names, (MAX_BEYOND * np.sqrt(np.diag(covariance))).tolist(), strict=True):
+        field = model.plant.parameters.__dataclass_fields__.get(name)
+        least = None if field is None else field.metadata.get("at_least")
+        if least is not None and least - half < values[name] < least:
+            values[name] = float(least)
+    try:
+        return plant_with(model.plant, values)
+    except InputError as error:
+        raise CheckError(f"{source}: what explains the log best is no machine ({error})") from error
 
 
 def _require_told(records: Sequence[_Record], found: Found) -> None:

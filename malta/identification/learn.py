@@ -15,8 +15,11 @@ from scipy.interpolate import BSpline, make_interp_spline
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.identification.imperfections import COMMON_GAIN, GAIN, KNOWN_SHARES
 from malta.identification.log import Log, log_of, reference_spline, require_currents, require_same_law
 from malta.identification.replay import reference_motion
+from malta.identification.signal_checks import driven_currents
+from malta.identification.spectra import SIGMA
 from malta.loops.loop import loop
 from malta.model.parameters import symbolic_names
 from malta.model.plant import Plant
@@ -24,7 +27,7 @@ from malta.model.plants import plant_of
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
 from malta.synthesis.feedforward import V0_STEPS
 
 INERTIA_SHARE = 0.02  # of the thrust's limit, that the inertia may take
@@ -97,6 +100,7 @@ def learn_v0(controller: Controller, log: Log) -> LearnedV0:
     >>> bool(abs(found.change).max() < 0.1)  # the table was right
     True
     """
+    controller = given_law("learn_v0", controller)
     plant = plant_of(controller.parameters)
     if not plant.has_stroke:
         raise InputError(
@@ -143,6 +147,9 @@ def _splines(low: float, high: float, step: float, source: str) -> BSpline:
 
 MIN_THRUST_SHARE = 0.05  # of the thrust's limit, that a stroke has to take
 FACTORS = (0.5, 2.0)  # of the thrust, beyond which something else is wrong
+LOAD_SHARE = 0.005  # of the thrust's limit, or a quarter of what v0 spans where that is more: an unknown load
+WAVES = (0.5, 8.0)  # of such a load, in the stroke
+FULL = 0.999  # of the limit of the thrust: at its limit
 
 
 @display
@@ -152,6 +159,10 @@ class Learned:
 
     factor : command that was needed over the command that the law's machine needs; above 1 where the drive is weaker
     deviation : standard deviation of the factor by the noise of the position sensor
+    load : N, amplitude of a load along the stroke that v0(z) lacks: a quarter of what v0 spans, or 0.5 % of the limit
+    by_load : how far such a load moves the factor at the worst wave length and phase
+    at_limit : share of the samples in which the thrust was at its limit
+    demand : largest thrust that the stroke takes of this machine, over its limit with the new constant
     parameter : the force constant of the thrust, by name; "": none scales the thrust alone, and none was named
     before, after : its value in the gain file, and the value from the log, SI; 0 without a parameter
     controller : the law with that value
@@ -169,20 +180,52 @@ class Learned:
 
     factor: float
     deviation: float
+    load: float
+    by_load: float
+    at_limit: float
+    demand: float
     parameter: str
     before: float
     after: float
     controller: Controller
 
     @property
+    def half(self) -> float:
+        """Half of the 95 % interval of the factor, by noise and an unknown load along the stroke."""
+        return float(np.hypot(SIGMA * self.deviation, self.by_load))
+
+    @property
+    def half_after(self) -> float:
+        """Half of the total 95 % interval of the new value, SI: mass and gains of sensors are as uncertain as usual.
+
+        They move the constant and not the factor, since the law believes the same ones. Friction moves neither: along a
+        stroke that begins and ends at rest, its sum with a_ref vanishes.
+        """
+        known = SIGMA * np.sqrt(KNOWN_SHARES["kg"] ** 2 + 2 * (GAIN**2 + COMMON_GAIN**2))
+        return float(abs(self.after) * np.hypot(self.half / self.factor, known))
+
+    @property
+    def limits(self) -> str:
+        """What the limit of the thrust has to say; "": nothing."""
+        if not self.at_limit and self.demand < 1:
+            return ""
+        was = (
+            f"the thrust was at its limit in {100 * self.at_limit:.2g} % of the samples"
+            if self.at_limit
+            else ""
+        )
+        will = f"the same stroke takes {100 * self.demand:.3g} % of the limit" if self.demand >= 1 else ""
+        return "; ".join(part for part in (was, will) if part)
+
+    @property
     def description(self) -> Description:
         """The factor and the force constant."""
         rows = (
+            ("thrust", f"{self.factor:.4f} +- {self.half:.2g} times the command that was expected"),
             (
-                "thrust",
-                f"{self.factor:.4f} +- {1.96 * self.deviation:.2g} times the command that was expected",
+                self.parameter or "no parameter by itself",
+                f"{self.before:.5g} -> {self.after:.5g} +- {self.half_after:.2g}",
             ),
-            (self.parameter or "no parameter by itself", f"{self.before:.5g} -> {self.after:.5g}"),
         )
         return Description(f"Learned for {self.controller.name!r}", rows)
 
@@ -207,7 +250,7 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     alone, as where magnets make all forces.
 
     Raises InputError for a machine without a stroke, and for a log without one; CheckError for a factor out of reason,
-    and a log of another machine.
+    a thrust that was at its limit, and a log of another machine.
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -219,6 +262,7 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     >>> found.parameter, f"{found.factor:.2f}"
     ('K_D', '1.11')
     """
+    controller = given_law("learn", controller)
     believed = plant_of(controller.parameters)
     if not believed.has_stroke:
         raise InputError(
@@ -229,19 +273,40 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     if name and name not in symbolic_names(believed.parameters):
         known = " ".join(symbolic_names(believed.parameters))
         raise InputError("learn", name, "an unknown parameter", f"one of {known}")
-    factor, by_noise = _thrust_factor(controller, believed, log)
+    factor, by_noise, by_load = _thrust_factor(controller, believed, log)
     if loop(believed, controller).sampled_forces.Bd.shape[1] > len(believed.inputs):
         factor += 1 - _thrust_factor(controller, believed, own_stroke(controller, log))[0]
     deviation = factor * float(np.array(believed.sensors.noise)[believed.stroke_output]) * by_noise
     if not FACTORS[0] < factor < FACTORS[1]:
         found = f"{log.source}: the stroke took {factor:.3g} times the thrust that was expected"
         raise CheckError(f"{found}: more than a force constant is wrong")
-    if not name:
-        return Learned(factor, deviation, name, 0.0, 0.0, controller)
-    before = float(getattr(believed.parameters, name))
-    par: Any = replace(controller.parameters, **{name: before / factor})
-    taught = replace(controller, name=f"{controller.name}_learned", parameters=par)
-    return Learned(factor, deviation, name, before, before / factor, taught)
+    par: Any = controller.parameters
+    before = after = float(getattr(par, name)) if name else 0.0
+    limits, taught = controller.limits, controller
+    if name:
+        after = before / factor
+        par = replace(par, **{name: after})
+        # The limit is that of the current: a drive that is weaker has less force.
+        now, then = (np.array(one.actuator.force_limit) for one in (plant_of(par), believed))
+        finite = np.isfinite(now) & np.isfinite(then)
+        grown = np.divide(now, then, out=np.ones(len(now)), where=finite & (then > 0))
+        limits = replace(limits, force=limits.force * grown)
+        taught = replace(controller, name=f"{controller.name}_learned", parameters=par, limits=limits)
+    k, v0 = believed.thrust_input, controller.feedforward.v0
+    load = max(LOAD_SHARE * controller.limits.force[k], float(np.ptp(v0[:, k])) / 4)
+    sent = np.abs(log.table("v", [believed.stroke.thrust])[:, 0]) if log.names("v") else np.zeros(1)
+    at_limit = float((sent >= FULL * controller.limits.force[k]).mean())
+    largest = believed.stroke.mass * float(np.abs(_acceleration(controller, believed, log)).max())
+    demand = (largest + float(np.abs(v0[:, k]).max())) * (1 if name else factor) / float(limits.force[k])
+    return Learned(
+        factor, deviation, float(load), float(load * by_load), at_limit, demand, name, before, after, taught
+    )
+
+
+def _acceleration(controller: Controller, believed: Plant, log: Log) -> FloatArray:
+    """z'' of the reference of the stroke at its samples, m/s2."""
+    t = controller.sample_time * np.arange(log.samples)
+    return np.asarray(reference_spline(log, [believed.stroke.name], controller.sample_time)(t, 2)[:, 0])
 
 
 def own_stroke(controller: Controller, log: Log) -> Log:
@@ -273,8 +338,8 @@ def thrust_constant(plant: Plant) -> str:
     return ""
 
 
-def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[float, float]:
-    """g of `learn`, and its relative deviation by white noise of 1 m in z.
+def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[float, float, float]:
+    """g of `learn`, its relative deviation by white noise of 1 m in z, and how far a wave of 1 N along z moves it.
 
     Raises InputError for a log without a stroke, and CheckError for missing samples.
     """
@@ -284,7 +349,7 @@ def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[f
     if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")
     t = Ts * np.arange(len(z_ref))
-    a = reference_spline(log, [stroke], Ts)(t, 2)[:, 0]
+    a = _acceleration(controller, believed, log)
     largest = float(np.abs(a).max())
     if believed.stroke.mass * largest < MIN_THRUST_SHARE * controller.limits.force[thrust]:
         found = f"{largest:.3g} m/s2 at most in ref.{stroke}"
@@ -294,8 +359,10 @@ def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[f
     along = float((z - z_ref) @ curved / (a @ a))
     table = controller.feedforward
     beyond = f - np.interp(z, table.z_grid, table.v0[:, thrust])
-    factor = float(beyond @ a / (believed.stroke.mass * (1 + along) * (a @ a)))
-    return factor, float(np.linalg.norm(curved)) / float(a @ a)
+    moved = believed.stroke.mass * (1 + along) * float(a @ a)
+    waves = np.geomspace(*WAVES, 40) * 2 * np.pi / max(float(np.ptp(z_ref)), 1e-300)
+    by_load = float(np.abs(np.exp(1j * waves[:, None] * z_ref) @ a).max()) / abs(moved)
+    return float(beyond @ a) / moved, float(np.linalg.norm(curved)) / float(a @ a), by_load
 
 
 def believed_thrust(believed: Plant, log: Log) -> FloatArray:
@@ -303,10 +370,12 @@ def believed_thrust(believed: Plant, log: Log) -> FloatArray:
     if believed.actuator.windings is None or not log.names("i"):
         return np.asarray(log.table("v", [believed.stroke.thrust])[:, 0])
     axes = [s.name for s in believed.drive.axes]
+    i = ca.SX.sym("i", len(axes))
+    thrust = ca.densify(believed.drive.force(i)[believed.thrust_input])
+    acting = [axes[k] for k in ca.jacobian(thrust, i).sparsity().get_triplet()[1]]
+    require_currents(log, axes, [name for name in driven_currents(believed) if name in acting])
     whole = np.zeros((log.samples, len(axes)))
-    require_currents(log, axes)
     for k, name in enumerate(log.names("i")):
         whole[:, axes.index(name)] = log.columns["i"][:, k]
-    i = ca.SX.sym("i", len(axes))
-    force = ca.Function("force", [i], [ca.densify(believed.drive.force(i)[believed.thrust_input])])
+    force = ca.Function("force", [i], [thrust])
     return evaluate(force.map(len(whole)), whole)[0][:, 0]

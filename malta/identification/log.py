@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -13,6 +13,10 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
+from malta.identification.readers.raster import unit_hint
+from malta.identification.readers.raw import GROUPS as GROUPS
+from malta.identification.readers.stored import EvenTimes, StoredTable
+from malta.identification.survey import READ, Survey, survey
 from malta.linear.sampling import split_delay, stored_blocks
 from malta.model.plant import Plant, Signal
 from malta.simulation.current_control import reading_errors
@@ -22,9 +26,6 @@ from malta.simulation.multisine import Multisine
 from malta.simulation.scenario import delay_of
 from malta.simulation.simulate import prepare
 from malta.simulation.trajectory import Trajectory
-
-GROUPS = {"y": "", "v": "", "i": "", "u": "", "reference": "ref.", "excitation": "exc.", "flags": "flag."}
-"""The groups of columns, and what stands before the signal's name in a heading."""
 
 
 @display
@@ -42,6 +43,9 @@ class Log:
         reference, excitation (forces beside the law's) and flags (1 while a limit is reached); k x signals each
     signals : by group: the names and units of its columns
     sha256 : of the file; "" of a run
+    jitter : s, standard deviation of the intervals between samples, but for how coarsely their times are written
+    idle : signals of i and u that were zero throughout, of which the file says that it leaves them out
+    notes : what reading made of the file: columns that are not used, times that are rounded
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -61,10 +65,15 @@ class Log:
     columns: Mapping[str, FloatArray]
     signals: Mapping[str, tuple[Signal, ...]]
     sha256: str = field(default="")
+    jitter: float = 0.0
+    idle: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "t", readonly(self.t))
-        object.__setattr__(self, "columns", {name: readonly(table) for name, table in self.columns.items()})
+        object.__setattr__(self, "t", _keep_table(self.t))
+        object.__setattr__(
+            self, "columns", {name: _keep_table(table) for name, table in self.columns.items()}
+        )
 
     @property
     def samples(self) -> int:
@@ -89,12 +98,18 @@ class Log:
             if name not in known:
                 expected = f"one of {' '.join(known)}" if known else f"one, as {GROUPS[group]}{name} [unit]"
                 raise InputError(self.source, GROUPS[group] + name, f"no such column of {group}", expected)
-        return np.asarray(self.columns[group][:, [known.index(name) for name in names]])
+        return choose_columns(self.columns[group], [known.index(name) for name in names])
 
     @cached_property
     def survey(self) -> Survey:
         """Statistics of its signals and what is wrong with its samples."""
         return survey(self)
+
+    @cached_property
+    def sensor_survey(self) -> Survey:
+        """The same of its readings and currents alone."""
+        known = self.__dict__.get("survey")
+        return survey(self, READ) if known is None else known
 
     @property
     def description(self) -> Description:
@@ -107,96 +122,27 @@ class Log:
         ]
         rows += [(group, " ".join(self.names(group))) for group in GROUPS if self.names(group)]
         rows.append(("findings", "; ".join(found.findings) or "none"))
+        rows += [("note", note) for note in self.notes]
         return Description(f"Log {self.source!r}", tuple(rows))
 
 
-@dataclass(frozen=True)
-class Survey:
-    """What a log shows at a first look.
-
-    statistics : by heading "name [unit]": least, mean, largest value and standard deviation, SI; missing ones apart
-    jitter : s, standard deviation of the intervals between samples
-    gaps : intervals longer than 1.5 samples
-    missing : by signal: readings that are not there
-    stuck : by measured output: the longest run of one and the same reading, samples, where it is suspicious
-    clipped : by measured output: samples at the end of its range, where they pile up
-    limits : by flag: share of the samples in which it was set
-    """
-
-    statistics: Mapping[str, tuple[float, float, float, float]]
-    jitter: float
-    gaps: int
-    missing: Mapping[str, int]
-    stuck: Mapping[str, int]
-    clipped: Mapping[str, int]
-    limits: Mapping[str, float]
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """What is wrong, in words."""
-        found = [f"{self.gaps} gaps"] if self.gaps else []
-        found += [f"{count} readings of {name} missing" for name, count in self.missing.items()]
-        found += [f"{name} stuck for {count} samples" for name, count in self.stuck.items()]
-        found += [f"{name} clipped in {count} samples" for name, count in self.clipped.items()]
-        return (
-            *found,
-            *(f"{name} in {100 * share:.3g} % of the time" for name, share in self.limits.items()),
-        )
+def _keep_table(table: FloatArray) -> FloatArray:
+    """A table that nobody changes: in memory, or in its file."""
+    return table if isinstance(table, StoredTable | EvenTimes) else readonly(table)
 
 
-STUCK_SHARE = 0.02  # of a log, for which a sensor may read the same
-MIN_STUCK_SAMPLES = 200  # samples of a reading that is called stuck
-PILE = 0.002  # of a log at an end of a sensor's range
-PILE_RATIO = 4.0  # times as many readings at the end as beside it
-MIN_DIFFERENT_READINGS = 5  # different readings, without which a sensor has no range
+def choose_columns(table: FloatArray, columns: Sequence[int]) -> FloatArray:
+    """Some columns of a table, in its file where that is long."""
+    if isinstance(table, StoredTable):
+        return cast("FloatArray", table.choose(columns))
+    return np.asarray(table[:, list(columns)])
 
 
-def survey(log: Log) -> Survey:
-    """The statistics of a log and what is wrong with its samples."""
-    statistics: dict[str, tuple[float, float, float, float]] = {}
-    missing: dict[str, int] = {}
-    for group, table in log.columns.items():
-        for signal, values in zip(log.signals[group], table.T, strict=True):
-            there = values[np.isfinite(values)]
-            if len(there) < len(values):
-                missing[GROUPS[group] + signal.name] = len(values) - len(there)
-            numbers = (there.min(), there.mean(), there.max(), there.std()) if len(there) else (np.nan,) * 4
-            heading = f"{GROUPS[group]}{signal.name} [{signal.unit}]"
-            statistics[heading] = tuple(map(float, numbers))  # type: ignore[assignment]
-    steps = np.diff(log.t)
-    near = steps[steps < 1.5 * log.sample_time]
-    stuck, clipped = {}, {}
-    for signal, values in zip(log.signals.get("y", ()), log.columns["y"].T, strict=True):
-        longest, piled = _longest_run(values), _count_piled(values)
-        if longest >= max(MIN_STUCK_SAMPLES, STUCK_SHARE * len(values)):
-            stuck[signal.name] = longest
-        elif piled:
-            clipped[signal.name] = piled
-    flags = zip(log.names("flags"), log.columns.get("flags", np.zeros((1, 0))).mean(axis=0), strict=True)
-    return Survey(
-        statistics,
-        jitter=float(near.std()) if len(near) else 0.0,
-        gaps=len(steps) - len(near),
-        missing=missing,
-        stuck=stuck,
-        clipped=clipped,
-        limits={name: float(share) for name, share in flags if share},
-    )
-
-
-def _longest_run(values: FloatArray) -> int:
-    """The number of samples of the longest run of one value."""
-    changes = np.flatnonzero(np.diff(values) != 0)
-    return int(np.diff(np.concatenate([[-1], changes, [len(values) - 1]])).max(initial=0))
-
-
-def _count_piled(values: FloatArray) -> int:
-    """The number of samples at an end of the range where many more pile up than beside it; 0: none do."""
-    levels, count = np.unique(values[np.isfinite(values)], return_counts=True)
-    if len(levels) < MIN_DIFFERENT_READINGS:
-        return 0
-    ends = ((count[0], count[1]), (count[-1], count[-2]))
-    return int(sum(end for end, next_ in ends if end > max(PILE * len(values), PILE_RATIO * next_)))
+def last_rows(table: FloatArray, count: int) -> FloatArray:
+    """The last rows of a table; of a long one they stay in its file."""
+    if isinstance(table, StoredTable):
+        return cast("FloatArray", table.last(count))
+    return table[len(table) - count :]
 
 
 def log_of(run: Trajectory) -> Log:
@@ -328,22 +274,32 @@ def in_order(log: Log, plant: Plant) -> Log:
         there = [name for name in names if name in have]
         if have == names or not there or (group == "y" and there != names):
             continue
+        if there == names:
+            columns[group], signals[group] = log.table(group, names), tuple(wanted)
+            continue
         table = np.full((log.samples, len(names)), otherwise)
         table[:, [names.index(name) for name in there]] = log.table(group, there)
         columns[group], signals[group] = table, tuple(wanted)
     return log if signals == log.signals else replace(log, columns=columns, signals=signals)
 
 
-def require_currents(log: Log, axes: Sequence[str]) -> None:
-    """Raise InputError for a log with a current that its machine has not.
+def require_currents(log: Log, axes: Sequence[str], driven: Sequence[str] = ()) -> None:
+    """Raise InputError for a log with a current that its machine has not, or without one that the law drives.
 
     axes : names of the machine's currents
+    driven : of these the currents that have to be there, unless the file says that they are zero
     """
     for name in log.names("i"):
         if name not in axes:
             raise InputError(
                 log.source, name, "a current that the machine has not", "one of " + " ".join(axes)
             )
+    for name in driven:
+        if name not in (*log.names("i"), *log.idle):
+            expected = (
+                f"{name} [A]: the law drives this current, and one that is left out would count as zero"
+            )
+            raise InputError(log.source, name, "no such column of i", expected)
 
 
 def require_same_law(log: Log, machine: str, sample_time: float) -> None:
@@ -351,5 +307,6 @@ def require_same_law(log: Log, machine: str, sample_time: float) -> None:
     if log.machine and log.machine != machine:
         raise CheckError(f"{log.source}: a log of machine {log.machine}, but the gain file is for {machine}")
     if abs(log.sample_time / sample_time - 1) > 1e-3:
-        found = f"samples of {log.sample_time:.6g} s, but the law's are {sample_time:.6g} s"
+        hint = unit_hint(log.sample_time, sample_time)
+        found = f"samples of {log.sample_time:.6g} s, but the law's are {sample_time:.6g} s{hint}"
         raise CheckError(f"{log.source}: {found}")

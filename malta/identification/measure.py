@@ -37,7 +37,7 @@ from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
 from malta.model.parameters import box_words, units_of
 from malta.model.plants import plant_of
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
 
 LAW_TOLERANCE = 0.02  # of a command at the lines, by which the law of the gain file may miss it
 SAMPLES = 32  # machines at random in the box, beside its corners
@@ -224,6 +224,7 @@ def measure(
     >>> found.refusal.startswith("|S| of"), 2.2 < found.peaks["x1"][0] < 2.6
     (True, True)
     """
+    controller = given_law("measure", controller)
     if not logs:
         raise InputError("measure", "logs", "none", "at least one log")
     plant = plant_of(controller.parameters if parameters is None else parameters)
@@ -423,6 +424,11 @@ def _curves(columns: ResponseColumns, cut: Cut, machines: Sequence[Cut]) -> tupl
 def sensitivity_of(columns: ResponseColumns, cut: Cut) -> ComplexArray:
     """S = I + G F_d^-1 F as measured, k x p x p."""
     return np.asarray(np.eye(columns.G.shape[1]) + columns.G @ np.linalg.solve(cut.F_d, cut.F))
+
+
+def loop_curves(loop: Loop, w: FloatArray) -> tuple[ComplexArray, ...]:
+    """S, T and L of each sensor, k x p, and S P, k x p x m, of a loop at frequencies below the Nyquist one, rad/s."""
+    return _predict_responses(cut_loop(loop, w))[:4]
 
 
 def _predict_responses(cut: Cut) -> tuple[ComplexArray, ...]:

@@ -13,10 +13,10 @@ curvature, slows the search and does not move where it ends: sum of (de/dtheta)'
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -26,14 +26,17 @@ from scipy.optimize import minimize
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
-from malta.identification.response import ResponseModel, axes_of, current_rate
+from malta.identification.readers.stored import StoredTable, store_rows
+from malta.identification.response import Flow, ResponseModel, axes_of, flow_of
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.simulation.engine.sample_loops import Loop, loop_of
+from malta.simulation.engine.sample_loops import SampleLoop, loop_of
 from malta.simulation.period import runge_kutta
 from malta.synthesis.riccati import dare
 
 BLOCK = 1000  # samples that are summed up together
+RUN_SAMPLES = 50_000  # samples that the filter runs through before its sums are taken
+PREFIX = 200_000  # samples of a long record that are run through again
 PASSES = 8  # of the filter over the log, at most
 SETTLED_STEP = 0.05  # standard deviations: steps of all parameters that are smaller end the search
 LARGE_STEP = 1.0  # standard deviations: after a larger step slopes are computed anew
@@ -48,6 +51,7 @@ FORGETTING_RATE = (
 STEP = 0.2  # over the fastest pole: about a step of the integration
 MOST_STEPS = 32  # of a sample
 MAX_LAG_SHARE = 1e-3  # of a sample, over the time constant of a current: what lags by less goes evenly
+LOST_LOG = "the filter does not follow the log: another machine than the model"
 BINS = 400  # between the lines, from which the process noise is found
 
 
@@ -62,6 +66,9 @@ class Predicted:
     missing : readings that are missing
     process : by position: rms of a sample of the process noise, m/s2 or rad/s2
     readings : k x p, those of the log, with predictions in place of missing ones and of outliers
+    expected : by output: the size that innovations should have, SI
+    loads : constant accelerations that no parameter explains, m/s2 or rad/s2
+    begin : the first state, SI
     """
 
     values: FloatArray
@@ -71,6 +78,9 @@ class Predicted:
     missing: int
     process: FloatArray
     readings: FloatArray
+    expected: FloatArray
+    loads: FloatArray
+    begin: FloatArray
 
 
 class NoiseModel(NamedTuple):
@@ -213,7 +223,7 @@ def _equations(shape: _Shape) -> _Equations:
 
 
 @lru_cache(maxsize=8)
-def _filter_loop(shape: _Shape) -> Loop:
+def _filter_loop(shape: _Shape) -> SampleLoop:
     """(x; i_k, i_k+1, y, whether it is there; numbers, d, K, s, nu) -> x, (e, w, better x) of each sample."""
     q = _equations(shape)
     n, p, half = q.x.numel(), q.read.numel(), q.x.numel() // 2
@@ -235,7 +245,7 @@ def _filter_loop(shape: _Shape) -> Loop:
 
 
 @lru_cache(maxsize=8)
-def _slope_loop(shape: _Shape, names: tuple[str, ...], count: int) -> Loop:
+def _slope_loop(shape: _Shape, names: tuple[str, ...], count: int) -> SampleLoop:
     """Slopes of e in parameters by the modes of the linear filter: E = -Re(C V z) - read'.
 
     (z of each parameter; i_k, i_k+1, better x; numbers, modes) -> z, slopes of each output's e
@@ -265,10 +275,8 @@ class _Search(NamedTuple):
 
     model: ResponseModel
     linear: _LinearFilter
-    i: FloatArray
-    after: FloatArray  # i one sample later
-    y: FloatArray  # 0 where missing
-    there: FloatArray
+    i: FloatArray  # k x currents; of a long record both stay in their file
+    y: FloatArray  # k x p, NaN where missing
     nu: float
 
     @property
@@ -283,26 +291,39 @@ class _Search(NamedTuple):
 
 
 class _FilterRun(NamedTuple):
-    """A run of the filter: innovations and weights, k x p, and states after each correction, k x n."""
+    """A run of the filter over some samples: y with 0 where one is missing, and whether it is there, innovations and
+    weights, k x p, states after each correction, k x n, and the currents at both ends of each sample."""
 
+    first: int  # the number of its first sample
+    y: FloatArray
+    there: FloatArray
     e: FloatArray
     w: FloatArray
     x: FloatArray
+    ends: tuple[FloatArray, FloatArray]
 
 
-def current_shares(rate: float, Ts: float, steps: int) -> FloatArray:
+def current_shares(flow: Flow, steps: int) -> FloatArray:
     """Shares of the current at the end of a sample at begin, middle and end of each step of it, and their mean.
 
     The rest is that at its begin. The shares f of a step have the first two moments of the current, sum of f and of
     (1 - t) f over it, as Runge and Kutta's method weighs them: so speed and place at its end are right for a current
     that settles within the step too.
 
-    rate : of the current, 1/s; 0: it goes evenly; infinite: it is held
+    flow : of the current
     """
-    if np.isinf(rate):
-        return np.zeros(3 * steps + 1)
     t = np.arange(steps + 1) / steps
-    a = rate * Ts
+    if np.isinf(flow.rate):
+        kept = (
+            np.clip(flow.until / flow.sample_time - t[:-1], 0.0, 1 / steps) * steps
+            if flow.until
+            else np.ones(steps)
+        )
+        new = 1 - kept  # the end of each step has the value of the next sample
+        middle = 3 * (new - new**2 / 2) - 0.5 * (new > 0)
+        f = np.column_stack([3 * new**2 - 2 * middle, middle, new > 0])
+        return np.append(f.ravel(), new.mean())
+    a = flow.rate * flow.sample_time
     if a < MAX_LAG_SHARE:
         f = np.column_stack([t[:-1], (t[:-1] + t[1:]) / 2, t[1:]])
         return np.append(f.ravel(), 0.5)
@@ -325,18 +346,24 @@ def _numbers(s: _Search, theta: FloatArray) -> FloatArray:
     twins = twins_of(par)
     value = [own.get(n, own.get(twins.get(n, ""), float(getattr(par, n)))) for n in symbolic_names(par)]
     error = [own.get(signal.name, 0.0) for signal in plant.sensors.errors]
-    shares = current_shares(current_rate(plant), model.sample_time, s.shape.steps)
+    shares = current_shares(flow_of(plant, model.sample_time), s.shape.steps)
     return np.array([*value, *error, *shares])
 
 
-def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _FilterRun:
-    """Run the filter over the log from the state x."""
-    p = s.y.shape[1]
+def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray, count: int) -> Iterator[_FilterRun]:
+    """Run the filter over the first `count` samples of the log from the state x, some of them at a time."""
+    p, state = s.y.shape[1], np.array(x, dtype=float)
     numbers = np.concatenate([_numbers(s, theta), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]])
-    rows = _filter_loop(s.shape)(x, (s.i, s.after, s.y, s.there), numbers)
-    if not np.isfinite(rows).all():
-        raise FloatingPointError
-    return _FilterRun(rows[:, :p], rows[:, p : 2 * p], rows[:, 2 * p :])
+    for first in range(0, count, RUN_SAMPLES):
+        end = min(first + RUN_SAMPLES, count)
+        i, y = np.asarray(s.i[first : end + 1]), np.asarray(s.y[first:end])
+        after = i[1:] if len(i) > end - first else next_rows(i)
+        i, there = i[: end - first], np.isfinite(y).astype(float)
+        y = np.where(there > 0, y, 0.0)
+        rows = _filter_loop(s.shape)(state, (i, after, y, there), numbers, state)
+        if not np.isfinite(rows).all():
+            raise FloatingPointError
+        yield _FilterRun(first, y, there, rows[:, :p], rows[:, p : 2 * p], rows[:, 2 * p :], (i, after))
 
 
 class _Modes(NamedTuple):
@@ -367,16 +394,20 @@ def _modes(s: _Search) -> _Modes:
     return _Modes(values[upper] + 0j, C @ V + 0j, inverse + 0j, inverse @ G + 0j, inverse @ A @ K + 0j)
 
 
-def _slopes(s: _Search, modes: _Modes, theta: FloatArray, x: FloatArray) -> FloatArray:
-    """The slopes of e in the parameters along the states x, k x p x parameters."""
+def _slopes(s: _Search, modes: _Modes, theta: FloatArray) -> Callable[[_FilterRun], FloatArray]:
+    """The slopes of e in the parameters along the states of each run, from run to run: k x p x parameters."""
     stacked = (
         np.concatenate([part.real, part.imag]) for part in (modes.values, modes.accelerated, modes.corrected)
     )
     seen = np.hstack([modes.seen.real, -modes.seen.imag])
     numbers = np.concatenate([_numbers(s, theta), *(part.T.ravel() for part in (*stacked, seen))])
     count, c = len(modes.values), len(theta)
-    loop = _slope_loop(s.shape, s.model.names, count)
-    return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), -1, c)
+    loop, z = _slope_loop(s.shape, s.model.names, count), np.zeros(2 * count * c)
+
+    def along(run: _FilterRun) -> FloatArray:
+        return loop(z, (*run.ends, run.x), numbers, z).reshape(len(run.x), -1, c)
+
+    return along
 
 
 def _normal(s: _Search, modes: _Modes, flight: _FilterRun, E: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -402,7 +433,7 @@ def _normal(s: _Search, modes: _Modes, flight: _FilterRun, E: FloatArray) -> tup
         w = flight.w[part] / s.linear.s**2
         own, weighed = E[part], w * flight.e[part]
         heavy, count = own * w[:, :, None], len(own)
-        turned = left * modes.values**first
+        turned = left * modes.values ** (flight.first + first)
         L = np.concatenate([turned.real, -turned.imag, settled], axis=2)
         mixed = (heavy.reshape(count, -1).T @ basis[:count]).reshape(p, c, size)
         told = (w.T @ products[:count]).reshape(p, size, size)
@@ -446,52 +477,175 @@ def predict(
 
     Raises CheckError for a filter that does not follow the log.
     """
-    there = np.isfinite(y).astype(float)
     linear = _filter(model, theta, noise, len(y) * model.sample_time)
-    s = _Search(
-        model, linear, i, next_rows(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else FREEDOM
+    s = _Search(model, linear, i, y, STUDENT if robust else FREEDOM)
+    begin = _SearchPoint(
+        np.array(theta), np.zeros(len(linear.A) // 2), np.array(model.place[list(model.plant.controlled)])
     )
-    n, c = len(linear.A), len(theta)
-    half, x = n // 2, np.array(model.place[list(model.plant.controlled)])
-    d = np.zeros(half)
-    theta, covariance, modes, moved = np.array(theta), np.zeros((c, c)), _modes(s), np.inf
-    for _ in range(PASSES):
-        try:
-            flight = _fly(s, theta, d, x)
-        except FloatingPointError:
-            raise CheckError(
-                f"{source}: the filter does not follow the log: another machine than the model"
-            ) from None
-        if moved > LARGE_STEP:
-            E = _slopes(s, modes, theta, flight.x)
-        N, g = _normal(s, modes, flight, E)
-        unit = np.sqrt(np.diag(N))
-        step = -np.linalg.lstsq(N / np.outer(unit, unit), g / unit, rcond=1e-13)[0] / unit
-        inverse = np.linalg.pinv(N / np.outer(unit, unit), rcond=1e-13) / np.outer(unit, unit)
-        covariance = inverse[:c, :c]
-        theta, d, x = theta + step[:c], d + step[c : c + half], x + step[c + half :]
-        moved = float((np.abs(step[:c]) / np.sqrt(np.diag(covariance))).max())
+    try:
+        at, normal, tally = _minimize(s, begin)
+        readings = _readings(s, at) if robust or tally.missing else y
+    except FloatingPointError:
+        raise CheckError(f"{source}: {LOST_LOG}") from None
+    c = len(theta)
+    covariance = tally.spread(s.nu) * _inverse(normal)[:c, :c]
+    return Predicted(
+        at.theta, covariance, np.sqrt(tally.squares / tally.kept), tally.outliers, tally.missing,
+        np.sqrt(noise.process), readings, linear.s, at.d, at.x,
+    )  # fmt: skip
+
+
+def information_of(
+    model: ResponseModel, noise: NoiseModel, i: FloatArray, y: FloatArray, source: str
+) -> FloatArray:
+    """What a log tells of parameters where the search starts, beside constant loads and the first state, 1 / SI^2.
+
+    Raises CheckError for a filter that does not follow the log.
+    """
+    linear, count = _filter(model, model.start, noise, len(y) * model.sample_time), min(len(y), PREFIX)
+    s, c = _Search(model, linear, i, y, FREEDOM), len(model.start)
+    at = _SearchPoint(
+        model.start, np.zeros(len(linear.A) // 2), np.array(model.place[list(model.plant.controlled)])
+    )
+    try:
+        (normal, _), *_ = _pass(s, _modes(s), at, count, count, None)
+    except FloatingPointError:
+        raise CheckError(f"{source}: {LOST_LOG}") from None
+    return len(y) / count * _beside_others(normal, c)
+
+
+def _beside_others(normal: FloatArray, c: int) -> FloatArray:
+    """The information of the first c unknowns of normal equations, with the others unknown too."""
+    more = np.linalg.pinv(normal[c:, c:], rcond=1e-13, hermitian=True)
+    return np.asarray(normal[:c, :c] - normal[:c, c:] @ more @ normal[c:, :c])
+
+
+def innovations_of(
+    model: ResponseModel, found: Predicted, noise: NoiseModel, i: FloatArray, y: FloatArray
+) -> FloatArray:
+    """The prediction errors of a log over their expected size, k x p; NaN where a reading is missing or an outlier."""
+    linear = _filter(model, found.values, noise, len(y) * model.sample_time)
+    s, parts = _Search(model, linear, i, y, FREEDOM), []
+    for run in _fly(s, found.values, found.loads, found.begin, len(y)):
+        size = run.e / linear.s
+        parts.append(np.where((run.there > 0) & (np.abs(size) <= OUTLIER), size, np.nan))
+    return np.concatenate(parts)
+
+
+def _inverse(normal: FloatArray) -> FloatArray:
+    """The inverse of normal equations, in units in which all are 1."""
+    unit = np.outer(*[np.sqrt(np.diag(normal))] * 2)
+    return np.asarray(np.linalg.pinv(normal / unit, rcond=1e-13) / unit)
+
+
+class _SearchPoint(NamedTuple):
+    """Where the search is: parameters, constant accelerations and the first state."""
+
+    theta: FloatArray
+    d: FloatArray
+    x: FloatArray
+
+    def step_by(self, step: FloatArray) -> _SearchPoint:
+        """The point a step further."""
+        c, half = len(self.theta), len(self.d)
+        return _SearchPoint(self.theta + step[:c], self.d + step[c : c + half], self.x + step[c + half :])
+
+
+def _minimize(s: _Search, begin: _SearchPoint) -> tuple[_SearchPoint, FloatArray, _Tally]:
+    """The point where the prediction errors are least, their normal equations there, and what was counted.
+
+    The first pass runs over the whole record, later ones over its first PREFIX samples. They tell how the gradient of
+    the whole differs from its linear prediction, g(u) = g(0) + N u + (samples / PREFIX) (what is beyond it there). A
+    record that is not longer is run through as a whole each time.
+    """
+    count, c = len(s.y), len(begin.theta)
+    prefix, modes = min(count, PREFIX), _modes(s)
+    whole, own, slopes, tally = _pass(s, modes, begin, count, prefix, None)
+    (N, g), (N_own, g_own), u = whole, own, np.zeros(len(whole[1]))
+    moved, ratio, at = np.inf, count / prefix, begin
+    for k in range(PASSES):
+        if k:
+            renewed = None if moved > LARGE_STEP else slopes
+            (N_own, g_own), _, slopes, counted = _pass(s, modes, at, prefix, prefix, renewed)
+            tally = counted if prefix == count else tally
+        left = g + N @ u + ratio * (g_own - own[1] - own[0] @ u)
+        normal = N + ratio * (N_own - own[0])
+        unit = np.sqrt(np.diag(normal))
+        step = -np.linalg.lstsq(normal / np.outer(unit, unit), left / unit, rcond=1e-13)[0] / unit
+        u, at = u + step, at.step_by(step)
+        moved = float((np.abs(step[:c]) / np.sqrt(np.diag(_inverse(normal))[:c])).max())
         if moved < SETTLED_STEP:
             break
-    return _result(s, theta, covariance, flight, noise)
+    return at, normal, tally
 
 
-def _result(
-    s: _Search, theta: FloatArray, covariance: FloatArray, flight: _FilterRun, noise: NoiseModel
-) -> Predicted:
-    """The record of a search that ended."""
-    size = flight.e / s.linear.s
-    off = (np.abs(size) > OUTLIER) & (s.there > 0)
-    kept = np.where((s.there > 0) & ~off, size, np.nan)
-    rms = np.sqrt(np.nanmean(kept**2, axis=0))
-    predicted = s.y - flight.e
-    gone = (s.there == 0) | off
-    spread = max(1.0, float(np.nanmean(kept**2)))
-    if s.nu < FREEDOM:  # of weights that depend on e: mean score^2 over the squared mean of the score's slope
-        w = flight.w
-        slope = (w * (1 - 2 * w * size**2 / (s.nu + 1))).sum() / w.sum()
-        spread = float((w**2 * size**2).sum() / w.sum() / slope**2)
-    return Predicted(
-        theta, spread * covariance, rms, int(off.sum()), int((s.there == 0).sum()),
-        np.sqrt(noise.process), np.where(gone, predicted, s.y),
-    )  # fmt: skip
+_Sums = tuple[FloatArray, FloatArray]
+
+
+def _pass(
+    s: _Search, modes: _Modes, at: _SearchPoint, count: int, prefix: int, slopes: list[FloatArray] | None
+) -> tuple[_Sums, _Sums, list[FloatArray], _Tally]:
+    """Run through the first `count` samples: sums of `_normal` over them and over the prefix, the slopes there, counts.
+
+    slopes : those of an earlier pass, of each run; None: they are computed anew
+    """
+    whole: _Sums | None = None
+    own: _Sums | None = None
+    kept: list[FloatArray] = []
+    tally = _Tally(s.y.shape[1])
+    along = _slopes(s, modes, at.theta)
+    for k, run in enumerate(_fly(s, at.theta, at.d, at.x, count)):
+        E = along(run) if slopes is None else slopes[k]
+        N, g = _normal(s, modes, run, E)
+        whole = (N, g) if whole is None else (whole[0] + N, whole[1] + g)
+        tally.add(run, run.e / s.linear.s, s.nu)
+        if run.first < prefix:
+            own = whole
+            kept.append(E)
+    assert whole is not None
+    assert own is not None
+    return whole, own, kept, tally
+
+
+class _Tally:
+    """What is counted of the innovations of a pass, in their expected sizes."""
+
+    def __init__(self, outputs: int) -> None:
+        self.squares, self.kept = np.zeros(outputs), np.zeros(outputs)
+        self.outliers, self.missing = 0, 0
+        self.weights = np.zeros(3)  # sums of w, of w (1 - 2 w size^2 / (nu + 1)) and of (w size)^2
+
+    def add(self, run: _FilterRun, size: FloatArray, nu: float) -> None:
+        """Count a run; size: its innovations over what is expected."""
+        there = run.there > 0
+        off = there & (np.abs(size) > OUTLIER)
+        good = there & ~off
+        self.squares += np.where(good, size**2, 0.0).sum(axis=0)
+        self.kept += good.sum(axis=0)
+        self.outliers += int(off.sum())
+        self.missing += int((~there).sum())
+        if nu < FREEDOM:
+            w = run.w
+            slope = w * (1 - 2 * w * size**2 / (nu + 1))
+            self.weights += w.sum(), slope.sum(), (w**2 * size**2).sum()
+
+    def spread(self, nu: float) -> float:
+        """The variance of the innovations over what is expected; of weights that depend on e: mean score^2 over the
+        squared mean of the score's slope."""
+        if nu < FREEDOM:
+            total, slope, score = self.weights
+            return float(score / total / (slope / total) ** 2)
+        return max(1.0, float(self.squares.sum() / self.kept.sum()))
+
+
+def _readings(s: _Search, at: _SearchPoint) -> FloatArray:
+    """The readings of the log, with predictions in place of missing ones and of outliers."""
+
+    def blocks() -> Iterator[FloatArray]:
+        for run in _fly(s, at.theta, at.d, at.x, len(s.y)):
+            off = (run.there == 0) | (np.abs(run.e / s.linear.s) > OUTLIER)
+            yield np.where(off, run.y - run.e, run.y)
+
+    if isinstance(s.y, StoredTable):
+        return cast("FloatArray", store_rows(blocks(), s.y.shape[1], s.y.path))
+    return np.concatenate(list(blocks()))

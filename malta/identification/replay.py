@@ -19,14 +19,14 @@ from malta.identification.spectra import MAX_PARAMETER_CHANGE, sentence_of
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
-from malta.simulation.engine.sample_loops import Loop, loop_of
+from malta.simulation.engine.sample_loops import SampleLoop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
 from malta.simulation.period import law_reference
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario, Simulation, simulation_of
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
 from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, gains_of, interpolate, look_ahead
 from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
@@ -147,6 +147,7 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     >>> malta.identification.replay_law(controller, malta.identification.log_of(run)).same
     True
     """
+    controller = given_law("replay_law", controller)
     plant = plant_of(controller.parameters)
     require_same_law(log, plant.name, controller.sample_time)
     log = in_order(log, plant)
@@ -308,7 +309,7 @@ def _run(simulation: Simulation, inputs: Inputs, y: FloatArray) -> tuple[FloatAr
 
 
 @lru_cache(maxsize=4)
-def _law_loop(simulation: Simulation) -> Loop:
+def _law_loop(simulation: Simulation) -> SampleLoop:
     """The law over samples: (xi_pred, e, frozen; given, y, v0) -> (v, innovation) of each."""
     plant, c, _, setup = simulation
     p, n, m = len(plant.outputs), len(c.states), len(c.forces)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.linalg import expm
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
+from malta.identification.imperfections import Imperfection, disturb, skews
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.model.plants import plant_of
@@ -44,6 +45,7 @@ class ResponseModel:
     sample_time : s
     around : points x currents, A: where the machine is linearized beside the mean, so that the mean of A and B is that
         over the noise which the law makes of the sensors'; a point at 0 of one that is quiet
+    bench : imperfections of the bench, whose values follow the parameters' in theta
     """
 
     plant: Plant
@@ -53,6 +55,7 @@ class ResponseModel:
     i: FloatArray
     sample_time: float
     around: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    bench: tuple[Imperfection, ...] = ()
 
     @cached_property
     def start(self) -> FloatArray:
@@ -81,29 +84,26 @@ class ResponseModel:
         Y = G I + T (x_0 - x_N) / N with the states x_0 and x_N at both ends.
         """
         A, B, C, late = self.matrices(theta)
-        n, m, Ts = len(A), B.shape[1], self.sample_time
-        rate = current_rate(self.plant)
-        held = bool(np.isinf(rate))
-        rate = 0.0 if held else rate
-        whole = np.zeros((n + 2 * m,) * 2)
-        whole[:n, :n], whole[:n, n : n + m] = A, B
-        whole[n : n + m, n : n + m], whole[n : n + m, n + m :] = (
-            -rate * np.eye(m),
-            (rate or 1 / Ts) * np.eye(m),
-        )
-        E = expm(whole * Ts)
-        at, growing = E[:n, n : n + m], E[:n, n + m :]
-        z = np.exp(1j * np.asarray(w) * Ts)[:, None, None]
-        # What the current goes towards, from its values at both ends: its command behind a lag, else its growth.
-        left = np.exp(-rate * Ts)
-        part = growing / (1 - left) if rate else growing
-        Phi, unit = E[:n, :n], np.eye(n)
-        forced = [at] if held else [at - left * part, part]
-        blocks = transfer(Phi, C, np.hstack([*forced, unit]), z[:, 0, 0])
-        found = np.concatenate([blocks[:, :, :m], z * blocks[:, :, -n:]], axis=2)
-        if not held:
+        m, Ts, z = B.shape[1], self.sample_time, np.exp(1j * np.asarray(w) * self.sample_time)
+        lags = np.array(self._lags(theta[: len(self.names)])).ravel()
+        older = skews(self.bench, theta[len(self.names) :], len(C))
+        Phi, forced = _step(A, B, self._flow, Ts)
+        samples = int(late.item() // Ts)
+        read, direct = C, np.zeros((len(C), forced.shape[1]))
+        if late.item() > 0:  # of a state within the sample before: with the hold, not as between samples
+            part, acting = _step(A, B, self._flow, (samples + 1) * Ts - late.item())
+            read, direct, samples = C @ part, C @ acting, samples + 1
+        blocks = transfer(Phi, read, np.hstack([forced, np.eye(len(A))]), z)
+        blocks[:, :, : forced.shape[1]] += direct
+        z = z[:, None, None]
+        found = np.concatenate([blocks[:, :, :m], z * blocks[:, :, forced.shape[1] :]], axis=2)
+        if forced.shape[1] > m:
             found[:, :, :m] += z * blocks[:, :, m : 2 * m]
-        found *= np.exp(-1j * np.asarray(w) * late.item())[:, None, None]
+        found *= z**-samples
+        # A lag or a skew that is estimated, small beside a sample or of either sign, acts on readings that are smooth.
+        if lags.any() or older.any():
+            s = 1j * np.asarray(w)[:, None]
+            found *= (np.exp(-s * older) / (1 + s * lags))[:, :, None]
         return found[:, :, :m], found[:, :, m:]
 
     def slopes(self, theta: FloatArray, w: FloatArray) -> ComplexArray:
@@ -112,6 +112,11 @@ class ResponseModel:
         return np.array(
             [(self.response(theta + h, w) - self.response(theta - h, w)) / (2 * STEP) for h in steps]
         )
+
+    @cached_property
+    def _flow(self) -> Flow:
+        """How its currents go from sample to sample."""
+        return flow_of(self.plant, self.sample_time)
 
     @cached_property
     def _equations(self) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -139,15 +144,35 @@ class ResponseModel:
         around : points beside the mean currents, over which they are means; None: the model's own
         """
         points = self.around if around is None else around
-        found = self._matrices.map(len(points))(theta, (self.i + points).T)
+        n = len(self.names)
+        found = self._matrices.map(len(points))(theta[:n], (self.i + points).T)
         A, B, C, late = (np.array(M).reshape(M.shape[0], len(points), -1).mean(axis=1) for M in found)
+        if self.bench:
+            A, B, C = disturb(self.plant, self.bench, theta[n:], A, B, C)
         return A, B, C, late
+
+    def linear(self, theta: FloatArray) -> tuple[FloatArray, ...]:
+        """`matrices`, and the lags of the outputs that are parameters, s."""
+        return *self.matrices(theta), np.array(self._lags(theta[: len(self.names)]))
+
+    @cached_property
+    def _lags(self) -> ca.Function:
+        """Parameters -> lags of the outputs that are parameters, s; 0 of others, which are states."""
+        theta, *_, sensors = self._equations
+        lags = [lag if isinstance(lag, ca.SX) else 0.0 for lag in sensors.lag]
+        return ca.Function("lags", [theta], [ca.densify(ca.vertcat(ca.SX(0, 1), *lags))])
+
+    @property
+    def lag_named(self) -> bool:
+        """Whether a lag of the sensors is among the parameters."""
+        return bool(ca.depends_on(ca.vertcat(ca.SX(0, 1), *self._equations[5].lag), self._equations[0]))
 
     @cached_property
     def _matrices(self) -> ca.Function:
         """Parameters, currents -> A, B, C of the design model's states and lagging readings, and the dead time, s."""
         theta, x, i, rate, read, sensors = self._equations
         keep, used = list(self.plant.controlled), self._places
+        sensors = replace(sensors, lag=tuple(0.0 if isinstance(lag, ca.SX) else lag for lag in sensors.lag))
         blocks = (
             ca.jacobian(rate, x)[keep, keep],
             ca.jacobian(rate, i)[keep, used],
@@ -166,17 +191,15 @@ class ResponseModel:
         loads, forces that change with the place.
 
         The remainder r = f(x, i) - f(x_0, i_0) - A (x - x_0) - B (i - i_0) is a known input, as it is small and the
-        motion is measured: its response is that of the linear machine, C (s - A)^-1 r, beside the remainder of h. Zero
-        for a machine whose states are not (q, q').
+        motion is measured: its response is that of the linear machine, C (s - A)^-1 r, beside the remainder of h.
+        States that are not (q, q') move as the measured currents move the linear machine.
 
         theta : parameters, SI
         outputs : harmonics x p, Fourier coefficients of the outputs over a period, from 0 on
         currents : the same of the measured currents
         rate : rad/s of the first harmonic
         """
-        if not self.plant.second_order:
-            return np.zeros_like(outputs)
-        A, _, C, late = self.matrices(theta)
+        A, B, C, late = self.matrices(theta)
         A_0, B_0, C_0, _ = self.matrices(theta, np.zeros((1, len(self.i))))
         count, n = len(outputs), len(self.plant.controlled)
         samples = 4 * count
@@ -187,11 +210,21 @@ class ResponseModel:
             return np.asarray(np.fft.irfft(whole, samples, axis=0)) * samples
 
         w = rate * np.arange(count)
-        y, i = signal(outputs), signal(currents * self._between_samples(w)[:, None])
-        q = evaluate(self._positions.map(samples), y)[0]
-        moving = np.fft.rfft(q, axis=0)[:count] / samples * (1j * w)[:, None]
-        x = np.hstack([q, signal(moving)])
-        f, h = evaluate(self._values.map(samples), np.tile(theta, (samples, 1)), x, i)
+        flowing = currents * self.hold(w)[:, None]
+        i = signal(flowing)
+        if self.plant.second_order:
+            q = evaluate(self._positions.map(samples), signal(outputs))[0]
+            moving = np.fft.rfft(q, axis=0)[:count] / samples * (1j * w)[:, None]
+            x = np.hstack([q, signal(moving)])
+        else:
+            own = np.zeros((count, n), dtype=complex)
+            own[0] = self.place[list(self.plant.controlled)]
+            own[1:] = np.linalg.solve(
+                1j * w[1:, None, None] * np.eye(n) - A[:n, :n], (flowing[1:] @ B[:n].T)[..., None]
+            )[..., 0]
+            x = signal(own)
+        own = np.tile(theta[: len(self.names)], (samples, 1))
+        f, h = evaluate(self._values.map(samples), own, x, i)
         off_x, off_i = x - self.place[list(self.plant.controlled)], i - self.i
         r = f - off_x @ A_0[:n, :n].T - off_i @ B_0[:n].T
         bent = h - off_x @ C_0[:, :n].T if C.shape[1] == n else np.zeros_like(h)
@@ -202,17 +235,19 @@ class ResponseModel:
         H[0] = 0
         return np.asarray(H * np.exp(-1j * w * late.item())[:, None])
 
-    def _between_samples(self, w: FloatArray) -> ComplexArray:
-        """Spectrum of a current between samples over that of its samples, at frequencies w from 0 on."""
-        rate, Ts = current_rate(self.plant), self.sample_time
-        s = 1j * w[1:]
+    def hold(self, w: FloatArray) -> ComplexArray:
+        """Spectrum of a current between samples over that of its samples, at frequencies w, rad/s."""
+        rate, until, Ts = self._flow
+        s = 1j * np.where(w == 0, 1.0, w)
         whole = (1 - np.exp(-s * Ts)) / (s * Ts)
         if np.isinf(rate):
-            return np.concatenate([[1.0 + 0j], whole])
-        if rate == 0:
-            return np.concatenate([[1.0 + 0j], np.abs(whole) ** 2])
-        risen = whole - (1 - np.exp(-(s + rate) * Ts)) / ((s + rate) * Ts)
-        return np.concatenate([[1.0 + 0j], whole + (np.exp(s * Ts) - 1) * risen / (1 - np.exp(-rate * Ts))])
+            found = whole * np.exp(s * (Ts - until)) if until else whole
+        elif rate == 0:
+            found = np.abs(whole) ** 2 + 0j
+        else:
+            risen = whole - (1 - np.exp(-(s + rate) * Ts)) / ((s + rate) * Ts)
+            found = whole + (np.exp(s * Ts) - 1) * risen / (1 - np.exp(-rate * Ts))
+        return np.where(w == 0, 1.0, found)
 
     @cached_property
     def _positions(self) -> ca.Function:
@@ -246,25 +281,61 @@ class ResponseModel:
         return [known.index(name) for name in self.currents]
 
 
+class Flow(NamedTuple):
+    """How a current goes from one measured value to the next: with a rate (1/s; 0: evenly), or it is held until `until`
+    (s after the sample; 0: with a rate, or held for the whole sample, if the rate is infinite)."""
+
+    rate: float
+    until: float
+    sample_time: float
+
+
+def _step(A: FloatArray, B: FloatArray, flow: Flow, t: float) -> tuple[FloatArray, FloatArray]:
+    """The state at t after a sample by the state there and the currents there, and, unless held, at the next sample."""
+    n, m = B.shape
+    held, Ts = bool(np.isinf(flow.rate)), flow.sample_time
+    rate = 0.0 if held else flow.rate
+    whole = np.zeros((n + 2 * m,) * 2)
+    whole[:n, :n], whole[:n, n : n + m] = A, B
+    whole[n : n + m, n : n + m] = -rate * np.eye(m)
+    whole[n : n + m, n + m :] = (rate or 1 / Ts) * np.eye(m)
+    E = expm(whole * t)
+    at, growing = E[:n, n : n + m], E[:n, n + m :]
+    if held:
+        new = expm(whole * max(t - flow.until, 0.0))[:n, n : n + m]
+        return E[:n, :n], np.hstack([at - new, new]) if flow.until else at
+    # What the current goes towards, from its values at both ends: its command behind a lag, else its growth.
+    left = np.exp(-rate * Ts)
+    part = growing / (1 - left) if rate else growing
+    return E[:n, :n], np.hstack([at - left * part, part])
+
+
 def points_of_noise(i: FloatArray, periods: int) -> FloatArray:
     """Points with the covariance of what currents do beside their mean period, and the mean 0: 2 x n of n directions.
 
     i : k x currents, whole periods
     """
-    parts = i.reshape(periods, -1, i.shape[1])
-    off = (parts - parts.mean(axis=0)).reshape(i.shape) * np.sqrt(periods / max(periods - 1, 1))
-    values, vectors = np.linalg.eigh(off.T @ off / len(off))
+    each, width = len(i) // periods, i.shape[1]
+    total, gram = np.zeros((each, width)), np.zeros((width, width))
+    middle = np.asarray(i[:each]).mean(axis=0)
+    for p in range(periods):  # one by one: a long record stays in its file
+        part = np.asarray(i[p * each : (p + 1) * each]) - middle
+        total += part
+        gram += part.T @ part
+    gram = (gram - total.T @ total / periods) / max(periods - 1, 1) / each
+    values, vectors = np.linalg.eigh(gram)
     loud = values > MIN_VARIANCE_SHARE * values.sum()
     points = (vectors[:, loud] * np.sqrt(loud.sum() * values[loud])).T
     return np.vstack([points, -points]) if loud.any() else np.zeros((1, i.shape[1]))
 
 
-def current_rate(plant: Plant) -> float:
-    """With which a current goes from one measured value to the next, 1/s; 0: evenly; infinite: it is held."""
+def flow_of(plant: Plant, sample_time: float) -> Flow:
+    """How a current goes from one measured value to the next; one that follows at once changes with its command."""
     actuator = plant.actuator
-    if plant.actuator.windings is None:
-        return actuator.crossover
-    return actuator.R / actuator.L if actuator.L else 0.0
+    if plant.actuator.windings is not None:
+        return Flow(actuator.R / actuator.L if actuator.L else 0.0, 0.0, sample_time)
+    late = actuator.delay(sample_time) % 1 if np.isinf(actuator.crossover) else 0.0
+    return Flow(actuator.crossover, late * sample_time, sample_time)
 
 
 def axes_of(plant: Plant) -> tuple[Any, ...]:
@@ -355,7 +426,7 @@ def well_found(F: FloatArray, names: Sequence[str], share: float) -> list[int]:
 
 def deviations(F: FloatArray) -> FloatArray:
     """Standard deviations of all parameters together from their information; infinite for one that does not act."""
-    size = np.sqrt(np.diag(F))
+    size = np.sqrt(np.maximum(np.diag(F), 0.0))  # below zero by rounding alone
     found = np.full(len(F), np.inf)
     act = size > 0
     if act.any():

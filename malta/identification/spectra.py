@@ -11,9 +11,9 @@ Which parameter that was taken as known explains what a model leaves of a log.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -21,9 +21,12 @@ from numpy.typing import NDArray
 
 from malta.errors import CheckError
 from malta.firmware.signals import place_of_readings
+from malta.identification.folding import FoldedSpectrum, fold
 from malta.identification.log import Log, in_order, require_same_law
 from malta.identification.prediction import NoiseModel, noise_between_lines, noise_covariances, without_spikes
+from malta.identification.readers.stored import EvenTimes, StoredTable, store_rows
 from malta.identification.response import STEP, ResponseModel, acting_parameters
+from malta.identification.survey import READ, blocks_of, faults_of
 from malta.model.parameters import twins_of
 
 if TYPE_CHECKING:
@@ -34,6 +37,8 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.integer[Any]]
 
 SIGMA = 1.959963984540054  # half of a 95 % interval
+TAIL_ROWS = 200_000  # at the end of a long log, that tell what is excited, and whether the loop is closed
+PERIOD_ERROR = 1e-4  # of its largest value, by which an excitation may differ from period to period
 NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
 MIN_LINE_SHARE = 1e-6  # of the largest line of an excitation: what is above is a line
 MIN_PERIODS = 3  # periods
@@ -48,7 +53,7 @@ FEEDBACK = 1e-3  # of an excitation: commands that move by less beside it do not
 class Spectrum(NamedTuple):
     """Fourier coefficients of a log over whole periods, of bins 0 to half of the samples, with the lines."""
 
-    outputs: ComplexArray
+    outputs: ComplexArray  # of a long record a FoldedSpectrum, which is read by bins too
     currents: ComplexArray
     lines: IntArray  # bins that were excited
     axis: IntArray  # of each line, the input that it excites most
@@ -64,9 +69,8 @@ class Spectrum(NamedTuple):
 def require_log(log: Log, machine: str, sample_time: float) -> None:
     """Raise CheckError for a log of another machine, of another sample time, or with sensors that failed."""
     require_same_law(log, machine, sample_time)
-    for what in ("stuck", "clipped"):
-        for sensor, count in getattr(log.survey, what).items():
-            raise CheckError(f"{log.source}: sensor {sensor} is {what} in {count} of {log.samples} samples")
+    for sensor, words in faults_of(log).items():
+        raise CheckError(f"{log.source}: sensor {sensor} {words}")
 
 
 def whole_periods(log: Log, excitation: FloatArray, samples: int) -> tuple[int, int]:
@@ -78,7 +82,8 @@ def whole_periods(log: Log, excitation: FloatArray, samples: int) -> tuple[int, 
         raise CheckError(f"{log.source}: nothing was excited: its columns exc.* are missing or zero")
     if not log.period:
         raise CheckError(
-            f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
+            f"{log.source}: the excitation does not repeat itself: whole periods are needed, or a line "
+            "'# period 1.0 s' in a .csv"
         )
     each = round(log.period / log.sample_time)
     if each < 2:
@@ -99,10 +104,14 @@ def excited_lines(log: Log, D: ComplexArray, periods: int) -> IntArray:
     size = np.abs(D[1:])
     lines = 1 + np.flatnonzero((size > MIN_LINE_SHARE * size.max()).any(axis=1))
     if (lines % periods).any():
-        raise CheckError(
-            f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
-        )
+        raise _wrong_period(log)
     return lines
+
+
+def _wrong_period(log: Log) -> CheckError:
+    return CheckError(
+        f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
+    )
 
 
 def require_independent(log: Log, D: ComplexArray) -> None:
@@ -134,9 +143,9 @@ def require_closed_loop(log: Log, pole: float) -> None:
     """
     if pole <= 0 or not log.names("v"):
         return
-    there = np.isfinite(log.columns["v"]).any(axis=0)
-    sent = log.columns["excitation"][:, there]
-    own = log.columns["v"][:, there] - sent
+    v, sent = (np.asarray(log.columns[group][-TAIL_ROWS:]) for group in ("v", "excitation"))
+    there = np.isfinite(v).any(axis=0)
+    sent, own = sent[:, there], v[:, there] - sent[:, there]
     moved, size = np.nanstd(own, axis=0), np.nanstd(sent, axis=0)
     share = moved[size > 0] / size[size > 0]
     if len(share) and share.max() < FEEDBACK:
@@ -149,8 +158,11 @@ def require_closed_loop(log: Log, pole: float) -> None:
 def noise_bins(lines: IntArray, periods: int, count: int) -> IntArray:
     """Of each line, the NEIGHBOURS nearest of `count` bins that are no multiples of 1 / period: noise alone."""
     top = min(count, int(lines[-1]) + 4 * periods)
-    free = np.setdiff1d(np.arange(1, top), np.arange(0, top, periods))
-    return np.asarray(free[np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]])
+    away = np.arange(-3 * NEIGHBOURS, 3 * NEIGHBOURS + 1)
+    near = lines[:, None] + away
+    free = (near > 0) & (near < top) & (near % periods != 0)
+    order = np.argsort(np.where(free, np.abs(away), top), axis=1, kind="stable")[:, :NEIGHBOURS]
+    return np.asarray(np.take_along_axis(near, order, axis=1))
 
 
 def windowed_covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
@@ -165,16 +177,26 @@ def windowed_covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArra
 
 def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
     """The spectra of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
+    N, periods = whole_periods(log, last_excitation(log), len(y))
     excitation = whole(log, "excitation")
-    N, periods = whole_periods(log, excitation, len(y))
-    outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
-    lines = excited_lines(log, D, periods)
-    require_independent(log, D[lines])
-    axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
-    pulse = D[lines, axis]
+    if isinstance(excitation, StoredTable):
+        sent = fold_excitation(log, excitation, N, periods)
+        at = excited_lines(log, sent, 1)
+        lines, sent = periods * at, sent[at]
+        both = fold([y, i], N, periods, MOTION_BAND_FACTOR * int(at[-1]) + 5)
+        of_readings, of_currents = both.columns(0, y.shape[1]), both.columns(y.shape[1], both.shape[1])
+        outputs, currents = cast("ComplexArray", of_readings), cast("ComplexArray", of_currents)
+        quiet = of_readings.quiet
+    else:
+        outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
+        lines = excited_lines(log, D, periods)
+        sent = D[lines]
+        quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
+    require_independent(log, sent)
+    axis = np.abs(sent).argmax(axis=1)  # the input that a line excites most
+    pulse = sent[np.arange(len(lines)), axis]
     harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
     rate = 2 * np.pi / (N * log.sample_time)
-    quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
     weight = 1 / np.maximum(quiet, 1e-300)
     return Spectrum(
         outputs,
@@ -182,7 +204,7 @@ def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
         lines,
         axis,
         pulse / np.abs(pulse),
-        noise_bins(lines, periods, len(D)),
+        noise_bins(lines, periods, N // 2 + 1),
         harmonics,
         rate,
         periods,
@@ -198,9 +220,33 @@ def straighten(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectrum
     """
     last = min(MOTION_BAND_FACTOR * int(s.lines[-1]) // s.periods, (len(s.outputs) - 1) // s.periods)
     places = s.periods * np.arange(last + 1)
+    curved = model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
+    if isinstance(s.outputs, FoldedSpectrum):
+        return s._replace(outputs=cast("ComplexArray", s.outputs.minus(places, curved)))
     outputs = np.array(s.outputs)
-    outputs[places] -= model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
+    outputs[places] -= curved
     return s._replace(outputs=outputs)
+
+
+def last_excitation(log: Log) -> FloatArray:
+    """The excitation at the end of a log: all of it where that is in memory."""
+    table = log.columns.get("excitation", np.zeros((0, 0)))
+    return np.asarray(table[-TAIL_ROWS:] if isinstance(table, StoredTable) else np.nan_to_num(table))
+
+
+def fold_excitation(log: Log, table: StoredTable, N: int, periods: int) -> ComplexArray:
+    """The coefficients of a long excitation at multiples of 1 / period.
+
+    Raises CheckError for one that does not repeat itself with its period.
+    """
+    n, begin = N // periods, len(table) - N
+    mean: FloatArray = np.zeros((n, table.shape[1]))
+    for p in range(periods):
+        mean = mean + table.rows(begin + p * n, begin + (p + 1) * n) / periods
+    ends = (table.rows(begin, begin + n), table.rows(len(table) - n, len(table)))
+    if max(float(np.abs(one - mean).max()) for one in ends) > PERIOD_ERROR * float(np.abs(mean).max()):
+        raise _wrong_period(log)
+    return np.asarray(np.fft.rfft(mean, axis=0) / n)
 
 
 def in_axes(log: Log, plant: Plant) -> Log:
@@ -219,17 +265,28 @@ def in_axes(log: Log, plant: Plant) -> Log:
 def readings(log: Log, *, robust: bool) -> FloatArray:
     """The measured outputs at even times, NaN where one is missing, or sticks out where outliers are looked for."""
     y = _at_even_times(log, "y")
-    missing = float(np.isnan(y).any(axis=1).mean())
-    if missing > MAX_MISSING_READINGS:
+    missing = missing_shares(log, "y", y)
+    if missing.size and missing.max() > MAX_MISSING_READINGS:
+        name, share = log.names("y")[int(missing.argmax())], 100 * float(missing.max())
         raise CheckError(
-            f"{log.source}: {100 * missing:.3g} % of the samples of y are missing, at most 20 % may be"
+            f"{log.source}: {share:.3g} % of the readings of {name} are missing, at most 20 % may be"
         )
-    return without_spikes(y) if robust else y
+    return without_spikes(np.asarray(y)) if robust else y
+
+
+def missing_shares(log: Log, group: str, table: FloatArray) -> FloatArray:
+    """The share of each column's values that is missing."""
+    if not isinstance(table, StoredTable):
+        return np.asarray(np.isnan(table).mean(axis=0))
+    known = log.sensor_survey.missing if group in READ else {}
+    return np.array([known.get(name, 0) / log.samples for name in log.names(group)])
 
 
 def _at_even_times(log: Log, group: str) -> FloatArray:
     """The columns of a group, a row for each sample time; NaN where the log has none."""
     table = log.columns.get(group, np.zeros((log.samples, 0)))
+    if isinstance(log.t, EvenTimes):
+        return table
     k = np.round((log.t - log.t[0]) / log.sample_time).astype(int)
     if k[-1] == log.samples - 1:
         return table
@@ -242,21 +299,44 @@ def _at_even_times(log: Log, group: str) -> FloatArray:
 
 def between_neighbours(table: FloatArray) -> FloatArray:
     """A table with missing entries on lines between their neighbours."""
+    if isinstance(table, StoredTable):
+        return fill_stored(table)
     if np.isfinite(table).all():
         return table
     t = np.arange(len(table))
     return np.column_stack([np.interp(t, t[np.isfinite(c)], c[np.isfinite(c)]) for c in table.T])
 
 
+def fill_stored(table: StoredTable) -> FloatArray:
+    """A long table with missing entries between their neighbours: itself where none are missing."""
+    if all(np.isfinite(block).all() for block in blocks_of(table)):
+        return cast("FloatArray", table)
+
+    def blocks() -> Iterator[FloatArray]:
+        before: FloatArray = np.zeros((0, table.shape[1]))
+        part: FloatArray = before
+        for block in blocks_of(table):
+            part = np.concatenate([part, block])
+            if np.isfinite(part[-1]).all():  # what is missing has a neighbour on either side
+                filled = between_neighbours(np.concatenate([before, part]))[len(before) :]
+                yield filled
+                before, part = filled[-1:], part[:0]
+        if len(part):
+            yield between_neighbours(np.concatenate([before, part]))[len(before) :]
+
+    return cast("FloatArray", store_rows(blocks(), table.shape[1], table.path))
+
+
 def whole(log: Log, group: str) -> FloatArray:
     """The columns of a group with missing samples between their neighbours. Raises CheckError for many of them."""
     table = _at_even_times(log, group)
-    missing = float(np.isnan(table).any(axis=1).mean())
-    if missing > MAX_MISSING_CURRENTS:
+    missing = missing_shares(log, group, table)
+    if missing.size and missing.max() > MAX_MISSING_CURRENTS:
+        name, share = log.names(group)[int(missing.argmax())], 100 * float(missing.max())
         raise CheckError(
-            f"{log.source}: {100 * missing:.3g} % of the samples of {group} are missing, at most 0.1 % may be"
+            f"{log.source}: {share:.3g} % of the values of {name} are missing, at most 0.1 % may be"
         )
-    return between_neighbours(table)
+    return between_neighbours(table) if missing.any() or not isinstance(table, StoredTable) else table
 
 
 class Residuals(NamedTuple):
@@ -366,32 +446,39 @@ def lines_of(log: Log, loop: Loop) -> list[SpectralLine]:
     plant = loop.plant
     require_log(log, plant.name, loop.sample_time)
     log = in_order(log, plant)
-    N, periods = whole_periods(
-        log, np.nan_to_num(log.columns.get("excitation", np.zeros((1, 1)))), log.samples
-    )
+    N, periods = whole_periods(log, last_excitation(log), log.samples)
     commands = (
         log.table("v", [s.name for s in plant.inputs]) if log.names("v") else np.zeros((log.samples, 0))
     )
-    tables = (
-        log.table("excitation", [s.name for s in plant.inputs]),
-        log.table("y", [s.name for s in plant.outputs]),
-        commands,
+    sent, y = (
+        log.table(g, [s.name for s in of]) for g, of in (("excitation", plant.inputs), ("y", plant.outputs))
     )
-    D, Y, V = (np.fft.rfft(_fill(table, log)[-N:], axis=0) / N for table in tables)
-    lines = excited_lines(log, D, periods)
+    Y: Any
+    V: Any
+    if isinstance(sent, StoredTable):
+        D = fold_excitation(log, sent, N, periods)
+        at = excited_lines(log, D, 1)
+        both = fold([_fill(y, log), _fill(commands, log)], N, periods, int(at[-1]) + 5)
+        Y, V = both.columns(0, y.shape[1]), both.columns(y.shape[1], both.shape[1])
+        lines, D = periods * at, D[at]
+    else:
+        D, Y, V = (np.fft.rfft(_fill(table, log)[-N:], axis=0) / N for table in (sent, y, commands))
+        lines = excited_lines(log, D, periods)
+        D = D[lines]
     C = _noise(Y, lines, periods)
     power = (np.abs(Y[lines]) ** 2 / np.einsum("kpp->kp", C).real).max(axis=1)
     if np.median(power) < MIN_LINE_POWER:
         raise CheckError(f"{log.source}: the excitation does not rise above the noise at half of the lines")
     rate = 2 * np.pi / (N * log.sample_time)
-    return [SpectralLine(rate * k, D[k], Y[k], V[k], c) for k, c in zip(lines.tolist(), C, strict=True)]
+    parts = zip(lines.tolist(), D, Y[lines], V[lines], C, strict=True)
+    return [SpectralLine(rate * k, d, at_line, v, c) for k, d, at_line, v, c in parts]
 
 
 def _fill(table: FloatArray, log: Log) -> FloatArray:
     """A table with missing samples between their neighbours. Raises CheckError for more than a few of them."""
-    bad = ~np.isfinite(table)
-    missing = int(bad.any(axis=1).sum()) + log.survey.gaps
-    if missing > MAX_MISSING_SAMPLES * log.samples or log.survey.gaps:
+    gaps = log.sensor_survey.gaps
+    missing = int(sum((~np.isfinite(block)).any(axis=1).sum() for block in blocks_of(table))) + gaps
+    if missing > MAX_MISSING_SAMPLES * log.samples or gaps:
         raise CheckError(f"{log.source}: {missing} samples are missing, at most 0.1 % may be, and no gaps")
     return between_neighbours(table)
 

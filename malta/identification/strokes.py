@@ -21,6 +21,7 @@ over the gain file's,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,7 +45,8 @@ from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
+from malta.work import is_stopped
 
 FORCE = 0.8  # of what the model says is missing, that the next stroke is sent at most
 KNOTS_PER_PERIOD = 4.0  # knots of the force in a period of the highest frequency of the reference
@@ -189,6 +191,7 @@ def next_stroke(
     >>> found.thrust.shape, found.patterns > 0
     ((2000,), True)
     """
+    controller = given_law("next_stroke", controller)
     plant = plant_of(controller.parameters)
     require_same_law(log, plant.name, controller.sample_time)
     if log.samples > MAX_SAMPLES:
@@ -315,6 +318,7 @@ def learn_strokes(
     distance: float | None = None,
     noise: float = 1.0,
     seed: int = 0,
+    progress: Callable[[float], None] | None = None,
 ) -> LearnedStrokes:
     """Fly one and the same stroke again and again, and learn from each log what the next one is sent.
 
@@ -328,6 +332,7 @@ def learn_strokes(
     distance : m; None: two thirds of the way from the middle to an end
     noise : of the sensors, in multiples; 0: without their steps too
     seed : of the noise of the first stroke
+    progress : called with the share of the strokes that is done
 
     Returns a LearnedStrokes.
 
@@ -340,6 +345,7 @@ def learn_strokes(
     >>> len(found.axial_error)
     2
     """
+    controller = given_law("learn_strokes", controller)
     if strokes < 1:
         raise InputError("learn", "strokes", str(strokes), "1 or more")
     scenario = stroke_of(plant, controller, distance).replace(noise=noise, quantize=noise > 0)
@@ -352,6 +358,10 @@ def learn_strokes(
     patterns = thrust_patterns(loop(plant_of(law.parameters), law), reference)
     thrust, after = own_thrust(law, scenario, patterns), None
     for k in range(1, strokes):
+        if is_stopped():
+            break
+        if progress is not None:
+            progress(k / strokes)
         run = _fly(plant, law, scenario.replace(seed=seed + k), thrust)
         errors.append(run)
         quiet.append(_fly(plant, law, still, thrust) if noise else run)

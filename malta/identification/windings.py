@@ -179,12 +179,12 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
     u = whole(log, "u")[:, [known.index(name.replace("i_", "u_", 1)) for name in used]]
     i = whole(log, "i")[:, [log.names("i").index(name) for name in used]]
     y = between_neighbours(readings(log, robust=False))
-    s = spectrum_of(log, np.hstack([y, u]), i)
-    signals = (
-        s.currents,
-        s.outputs[:, len(plant.outputs) :],
-        *_induced_spectra(plant, used, s, i, log.sample_time),
-    )
+    s = spectrum_of(log, y, i)
+    N = round(2 * np.pi / (s.rate * log.sample_time))
+    read, sent, flown = (
+        np.fft.rfft(np.asarray(table)[-N:], axis=0) / N for table in (y, u, i)
+    )  # at all bins
+    signals = (flown, sent, *_induced_spectra(plant, used, s, read, np.asarray(i)[-N:]))
     lines, between = (
         _Axes(log.sample_time, s.rate * bins, *(one[bins] for one in signals))
         for bins in (s.lines, s.between.ravel())
@@ -205,20 +205,20 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
 
 
 def _induced_spectra(
-    plant: Plant, used: list[str], s: Spectrum, i: FloatArray, Ts: float
+    plant: Plant, used: list[str], s: Spectrum, outputs: ComplexArray, i: FloatArray
 ) -> list[ComplexArray]:
     """The spectra of induced voltages, V, and of the coupling of moving axes, A/s; bins x axes each.
 
     Positions and speeds are those of the readings up to twice the highest line.
 
-    s : whose outputs begin with the readings
-    i : samples x axes of the log
+    outputs : bins x readings, all bins
+    i : samples x axes, whole periods
     """
-    N, count = round(2 * np.pi / (s.rate * Ts)), len(plant.outputs)
-    slow = np.arange(len(s.outputs)) <= MOTION_BAND_FACTOR * s.lines[-1]
-    w = s.rate * np.arange(len(s.outputs))
-    y = np.fft.irfft(s.outputs[:, :count] * slow[:, None] * N, N, axis=0)
-    speed = np.fft.irfft(1j * w[:, None] * s.outputs[:, :count] * slow[:, None] * N, N, axis=0)
+    N, count = len(i), len(plant.outputs)
+    slow = np.arange(len(outputs)) <= MOTION_BAND_FACTOR * s.lines[-1]
+    w = s.rate * np.arange(len(outputs))
+    y = np.fft.irfft(outputs * slow[:, None] * N, N, axis=0)
+    speed = np.fft.irfft(1j * w[:, None] * outputs * slow[:, None] * N, N, axis=0)
     read, moving, flowing = (ca.SX.sym("signal", size) for size in (count, count, len(used)))
     axes, q = [axis.name for axis in plant.drive.axes], plant.position_of(read)
     x = place_states(plant, ca.vertcat(q, ca.jtimes(q, read, moving)))
@@ -226,7 +226,7 @@ def _induced_spectra(
     whole_i[places] = flowing
     added = plant.drive.emf(x), plant.drive.coupling(x, whole_i)
     moved = ca.Function("moved", [read, moving, flowing], [ca.densify(one[places]) for one in added])
-    return [np.fft.rfft(table, axis=0) / N for table in evaluate(moved.map(N), y, speed, i[-N:])]
+    return [np.fft.rfft(table, axis=0) / N for table in evaluate(moved.map(N), y, speed, i)]
 
 
 def _search(lines: _Axes, between: _Axes, begin: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:

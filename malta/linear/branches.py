@@ -16,16 +16,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 from flint import acb, arb
 
-from malta.linear.expressions import (
-    KNOWN_OPERATIONS,
-    POINTS,
-    Arithmetic,
-    MatrixProgram,
-    NotAnalytic,
-    RootEntry,
-    Step,
-    program,
-)
+from malta.linear.balls import POINTS, root_enclosure
+from malta.linear.expressions import KNOWN_OPERATIONS, Arithmetic, MatrixProgram, NotAnalytic, Step, program
+from malta.linear.roots import RootEntry
 
 _OTHER_SYMBOL_OPERATIONS: dict[str, Any] = {
     name: getattr(ca, name) for name in KNOWN_OPERATIONS if hasattr(ca, name)
@@ -35,6 +28,9 @@ _OTHER_SYMBOL_OPERATIONS: dict[str, Any] = {
 SYMBOLS = Arithmetic(
     ca.SX, {**_OTHER_SYMBOL_OPERATIONS, "pow": ca.power, "root": lambda entry, p: entry.at_symbols(p)}
 )
+
+
+_TURNS = ("fabs", "fmax", "fmin")
 
 
 class Interval:
@@ -90,13 +86,64 @@ def _by_balls(function: Callable[..., Any]) -> Callable[..., Interval]:
 
 
 def _root_of_intervals(entry: RootEntry, p: Sequence[Interval]) -> Interval:
-    return _by_balls(lambda *z: entry.enclosure([acb(x) for x in z], is_one=False).real)(*p)
+    return _by_balls(lambda *z: root_enclosure(entry, [acb(x) for x in z], is_one=False).real)(*p)
 
 
 INTERVALS = Arithmetic(
     lambda x: Interval(x, x),
     {**{name: _by_balls(f) for name, f in POINTS.others.items()}, "root": _root_of_intervals},
 )
+
+
+def _span(function: Callable[..., tuple[float, float]]) -> Callable[..., Interval]:
+    return lambda *sides: Interval(*function(*sides))
+
+
+def _root_of_span(x: Interval) -> tuple[float, float]:
+    low, high = math.sqrt(max(x.low, 0.0)), math.sqrt(max(x.high, 0.0))
+    return math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
+
+
+# Intervals with branches, which are enclosed where they turn, and roots down to zero.
+SPANS = Arithmetic(
+    INTERVALS.constant,
+    {
+        **INTERVALS.others,
+        "sqrt": _span(_root_of_span),
+        "fabs": _span(lambda x: (max(x.low, -x.high, 0.0), max(x.high, -x.low))),
+        "fmax": _span(lambda x, y: (max(x.low, y.low), max(x.high, y.high))),
+        "fmin": _span(lambda x, y: (min(x.low, y.low), min(x.high, y.high))),
+    },
+)
+
+
+def is_identity_within(function: ca.Function, sides: Sequence[tuple[float, float]]) -> bool:
+    """Whether a function of a vector is its argument in a box: by larger and smaller numbers that are apart in it.
+
+    Raises NotAnalytic for operations without an enclosure.
+    """
+    model, p = program(function), ca.SX.sym("p", len(sides))
+    cells: list[tuple[Any, Interval]] = []
+    for name, target, operands, value in model.steps:
+        own = [cells[k] for k in operands]
+        if name == "input":
+            cells.append((p[target], Interval(*sides[target])))
+            continue
+        if name == "const":
+            cells.append((ca.SX(value), Interval(value, value)))
+            continue
+        span = SPANS.apply(name, [x for _, x in own], value)
+        if name in ("fmax", "fmin") and not (
+            own[0][1].low < own[1][1].high and own[1][1].low < own[0][1].high
+        ):
+            first = (own[0][1].low >= own[1][1].high) == (name == "fmax")
+            cells.append((own[0 if first else 1][0], span))
+        else:
+            symbols = [x for x, _ in own]
+            made = getattr(ca, name)(*symbols) if name in _TURNS else SYMBOLS.apply(name, symbols, value)
+            cells.append((made, span))
+    found = {i: cells[k][0] for i, _, k in model.entries[0]}
+    return len(found) == len(sides) and all(ca.is_equal(x, p[i], 2) for i, x in found.items())
 
 
 class _Undecided(Exception):

@@ -23,10 +23,10 @@ def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
 
     The states are those of plant, lags, stored inputs and compensator.
     """
-    return _close(c, *system.at(p), *difference_form(c), c.C, c.D)
+    return close_loop(c, *system.at(p), *difference_form(c), c.C, c.D)
 
 
-def _close(
+def close_loop(
     c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray,
     F_A: FloatArray, F_B: FloatArray, F_C: FloatArray, F_D: FloatArray,
 ) -> FloatArray:  # fmt: skip
@@ -86,7 +86,7 @@ def _poles(
         if g.inputs is not None:  # forces on these states in place of the inputs
             rows = B[:, list(g.inputs)]
             into, through, out = np.eye(len(x))[:, [x.index(i) for i in g.inputs]], rows @ through, rows @ out
-        closed = _close(c, A[:, x][:, :, x], into, C[:, :, x], *law, out, through)
+        closed = close_loop(c, A[:, x][:, :, x], into, C[:, :, x], *law, out, through)
         found.append(np.linalg.eigvals(closed))
     return np.concatenate(found, axis=1)
 

@@ -15,7 +15,7 @@ from malta.linear.uncertain import Compensator
 def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
     """A compensator as a record, from a Compensator, a control.StateSpace or TransferFunction, or a gain matrix.
 
-    Or from what has one as its attribute `compensator`, as a Controller.
+    Or from what has its fields as an attribute `compensator_fields`, as a Controller.
 
     Raises InputError when its inputs and outputs do not fit the system, or its sample time is unspecified.
     """
@@ -23,10 +23,8 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
     wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
     if isinstance(law, Compensator):
         found = law
-    elif isinstance(
-        getattr(law, "compensator", None), Compensator
-    ):  # a Controller, which this package does not know
-        found = law.compensator
+    elif isinstance(fields := getattr(law, "compensator_fields", None), dict):  # a Controller, not known here
+        found = Compensator(**fields)
     elif is_transfer(law) or hasattr(law, "dt") or hasattr(law, "ninputs") or isinstance(law, bool | None):
         own = from_control(law, "compensator", "law", expected=wanted)
         found = Compensator(own.A, own.B, own.C, own.D, sample_time=own.dt)

@@ -61,3 +61,14 @@ def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> 
     p = len(Cd)
     A = system_matrix(Ad, None, -Ts * Cd @ Ad, np.eye(p))
     return A, np.vstack([Bd, -Ts * Cd @ Bd])
+
+
+def covariance(A: FloatArray, W: FloatArray) -> FloatArray:
+    """Solve X = A X A' + W by doubling, for a stable A (n x n); slow poles next to 1 take some thirty steps."""
+    X, A = W, A.copy()
+    for _ in range(60):
+        more = A @ X @ A.T
+        X, A = X + more, A @ A
+        if np.abs(np.diag(more)).max() <= 1e-12 * np.abs(np.diag(X)).max():
+            break
+    return X

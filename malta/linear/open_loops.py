@@ -111,10 +111,11 @@ def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
 def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """s, or (z - 1) / T when sampled; z^-d of d whole samples; and F: at frequencies w."""
     T = law.sample_time
-    s: ComplexArray = 1j * np.frombuffer(w)
+    own, back = np.unique(np.frombuffer(w), return_inverse=True)  # rows share frequencies
+    s: ComplexArray = 1j * own
     turned = np.ones_like(s)
     if T is not None:
         turned, s = np.exp(-s * T * split_delay(law.delay)[0]), np.expm1(s * T) / T
     F_A, F_B = difference_form(law)
     F = law.C @ _resolvent(s, F_A[None], F_B[None]) + law.D
-    return s, turned, np.asarray(F, dtype=complex)
+    return s[back], turned[back], np.asarray(F[back], dtype=complex)

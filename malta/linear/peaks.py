@@ -167,15 +167,15 @@ def peak_gain(system: System, above: float = 0.0) -> Peak:
     Its levels rise from gains that were found, until the Hamiltonian matrix has no imaginary eigenvalues at RISE above
     the last one (Bruinsma and Steinbuch).
     """
+    if not len(system.A):
+        return Peak(float(np.linalg.norm(system.D, 2)), 0.0)
     system = system.balanced
-    w = np.array([0.0, np.inf])
-    if len(system.A):
-        w = np.concatenate([w, about_poles(eigenvalues(system.A))])
+    w = np.concatenate([[0.0, np.inf], about_poles(eigenvalues(system.A))])
     sizes = gains_at(system, w)
     if not np.isfinite(sizes).all():
         return Peak(math.inf, float(w[~np.isfinite(sizes)][0]))
     best, where = float(sizes.max()), float(w[sizes.argmax()])
-    if not len(system.A) or best == 0.0:
+    if best == 0.0:
         return Peak(best, where)
     for _ in range(LEVELS):
         ends = level_frequencies(system, max(best, above) * (1 + RISE))

@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from malta.loops.curves import LoopCurves as LoopCurves, loop_curves as loop_curves
     from malta.loops.linear_loops import LoopSystems as LoopSystems, loop_systems as loop_systems
     from malta.loops.loop import Loop as Loop
+    from malta.loops.noise import NoisePeaks as NoisePeaks, noise_peaks as noise_peaks
     from malta.loops.time_domain import Recovery as Recovery, recovery as recovery
 
 _NAMES = {
     "malta.loops.curves": "LoopCurves loop_curves",
     "malta.loops.linear_loops": "LoopSystems loop_systems",
     "malta.loops.loop": "Loop",
+    "malta.loops.noise": "NoisePeaks noise_peaks",
     "malta.loops.time_domain": "Recovery recovery",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES)

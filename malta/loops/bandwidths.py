@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -13,12 +13,44 @@ from malta.linear.falls import Fall, fall_frequencies
 from malta.linear.peaks import Peak, joined_channels, largest_gain, part_of
 from malta.loops.classical import Nominal
 
+if TYPE_CHECKING:
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
+
 
 def peak_of_channels(loop: Nominal, channels: Sequence[int]) -> Peak:
     """The largest sigma_max of the sensitivities of some channels of `loop.closed`, cut at once."""
     sets = joined_channels(loop.closed, channels)
     value, at = largest_gain(part_of(loop.closed, own, own) for own in sets)
     return Peak(value, loop.frequency(at))
+
+
+def in_sizes(loop: Nominal, sizes: FloatArray | None, outputs: Sequence[int] | None = None) -> Nominal:
+    """The same loop with readings in multiples of these sizes, SI; singular values of unlike units are of no use.
+
+    sizes : of each sensor; None: as they are
+    outputs : sensors that the loop has, of a part of the machine; None: all
+    """
+    if sizes is None:
+        return loop
+    sizes = sizes if outputs is None else sizes[list(outputs)]
+    P, F, column = loop.P, loop.F, sizes[:, None]
+    plant = replace(P, C=P.C / column, D=P.D / column)
+    return replace(loop, P=plant, F=replace(F, B=F.B * sizes, D=F.D * sizes))
+
+
+def reading_sizes(plant: Plant, believed: FloatArray | None) -> FloatArray | None:
+    """Sizes in which readings of unlike units are compared: the machine's noise, its sensors' ranges, or what a design
+    believes. None where all have one unit, and where nothing is known.
+
+    believed : variance of the noise of each sensor that the design is made for; None: it has none
+    """
+    if len({signal.unit for signal in plant.outputs}) == 1:
+        return None
+    variance = np.zeros(0) if believed is None else believed
+    known = (plant.sensors.deviations, np.asarray(plant.sensors.range), np.sqrt(np.asarray(variance)))
+    found = (one for one in known if one.size == len(plant.outputs) and (one > 0).all())
+    return next(found, None)
 
 
 def tracked_band(loop: Nominal, rank: int | None = None) -> tuple[float, float]:

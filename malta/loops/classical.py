@@ -32,6 +32,8 @@ from malta.linear.system import System
 
 ROUNDS = 60  # of the balance of a matrix at most
 BALANCE_TOLERANCE = 1e-9  # relative difference of norms of rows and columns
+# Of a row or column, relative: a matrix with entries on one side of its diagonal alone is scaled down to that.
+LEAST_NORM = 1e-9
 LEVELS = 12  # of a disk of several channels at most
 INNER_POINTS = np.linspace(0.0, 1.0, 9)  # of an interval between two levels
 RISE = 1e-7  # relative, above the smallest disk that was found, at which its search ends
@@ -132,17 +134,22 @@ class Classical(NamedTuple):
 
     disks: tuple[Disk, ...]
     delay: dict[str, float]  # s, by sensor
-    gang: dict[str, tuple[float, ...]]  # by sensor: largest |S|, |T|, |S P| (m/N), |F S| (N/m)
+    # by sensor: largest |S|, |T|, |S P| (m/N), |F S| (N/m), see gang_of_four
+    gang: dict[str, tuple[float, ...]]
 
 
-def classical_margins(loop: Nominal, sensors: Sequence[str]) -> Classical:
-    """The disk margins, delay margins and the gang of four of a stable loop; `sensors` names the rows of y."""
+def classical_margins(loop: Nominal, sensors: Sequence[str], units: Sequence[str] = ()) -> Classical:
+    """The disk margins, delay margins and the gang of four of a stable loop.
+
+    sensors : names of the rows of y
+    units : of the forces u; (): they are alike
+    """
     kinds: tuple[Kind, ...] = ("forces", "sensors", "forces and sensors")
     disks = [disk_margin(loop, kind) for kind in kinds] + disk_margins_alone(loop, sensors)
     return Classical(
         tuple(disks),
         dict(zip(sensors, delay_margins(loop), strict=True)),
-        dict(zip(sensors, gang_of_four(loop), strict=True)),
+        dict(zip(sensors, gang_of_four(loop, units), strict=True)),
     )
 
 
@@ -249,11 +256,11 @@ def balance_scales(M: ComplexArray) -> FloatArray:
     d = np.ones((*size.shape[:2], 1))
     off = (size * (1 - np.eye(size.shape[-1]))) ** 2
     turned = np.ascontiguousarray(off.swapaxes(1, 2))
+    least = LEAST_NORM * np.einsum("kii->ki", size).max(axis=1)[:, None, None] + np.finfo(float).tiny
     for _ in range(ROUNDS):
         squares = d**2
         rows, columns = np.sqrt(squares * (off @ (1 / squares))), np.sqrt(turned @ squares / squares)
-        both = (rows > 0) & (columns > 0)
-        ratio = np.where(both, columns / np.where(both, rows, 1), 1)
+        ratio = np.maximum(columns, least) / np.maximum(rows, least)
         d = d * ratio**0.25
         if np.abs(ratio - 1).max(initial=0.0) < BALANCE_TOLERANCE:
             break
@@ -280,8 +287,11 @@ def crossings_at(loop: Nominal, channel: int) -> tuple[Crossing, ...]:
     return tuple(Crossing(loop.frequency(w), value) for w, value in found)
 
 
-def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
-    """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency."""
+def gang_of_four(loop: Nominal, units: Sequence[str] = ()) -> list[tuple[float, ...]]:
+    """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency.
+
+    units : of the forces; of unlike ones j are those in the unit of the axis: force i, or the last; (): they are alike
+    """
 
     def peak(row: int, columns: Iterable[int], *, turned: bool = False) -> float:
         pairs = (((column, row) if turned else (row, column)) for column in columns)
@@ -292,7 +302,11 @@ def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
         S = loop.sensitivity(i)
         T = replace(S, D=S.D - 1)
         both = peak_gain(S).value, peak_gain(T).value
-        found.append((*both, peak(i, loop.inputs), peak(i, loop.inputs, turned=True)))
+        own = units[min(i, len(units) - 1)] if units else ""
+        alike = [
+            j for j, unit in zip(loop.inputs, units or [own] * len(loop.inputs), strict=False) if unit == own
+        ]
+        found.append((*both, peak(i, alike), peak(i, alike, turned=True)))
     return found
 
 

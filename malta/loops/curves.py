@@ -10,6 +10,7 @@ wherever a curve turns. Margins are not read off it: see linear/peaks.py.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import require_known
+from malta.frames import data_frame
 from malta.linear.interconnection import series
 from malta.linear.peaks import Crossing
 from malta.linear.system import System
@@ -194,6 +196,18 @@ class LoopCurves:
             return s
         z = 1 + T * s
         return np.asarray(np.log1p(T * s[(np.abs(z) > 1e-6) & (np.abs(z) < 1e3)]) / T)
+
+    def to_pandas(self) -> Any:
+        """Responses by frequency as a pandas.DataFrame, complex: "S z y1" of a loop's S from sensor y1 to z.
+
+        Raises InputError where pandas is not installed.
+        """
+        names, columns = [s.name for s in self.channels()], dict[str, ComplexArray]()
+        for key in ("L", "S", "T"):
+            response = getattr(self.responses, key)
+            for i, k in itertools.product(range(len(names)), repeat=2):
+                columns[f"{key} {names[i]} {names[k]}"] = response[:, i, k]
+        return data_frame(columns, ("w [rad/s]", self.w))
 
     @property
     def description(self) -> Description:

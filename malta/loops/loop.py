@@ -33,9 +33,9 @@ from malta.loops.windings import LAST_STAGE, CurrentLoops, chosen_loops, left_ou
 from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
 from malta.model.places import position_at
-from malta.model.plant import Plant
+from malta.model.plant import Plant, given_plant
 from malta.model.traced import with_parameters
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
 from malta.synthesis.law import law_at
 
 
@@ -163,7 +163,8 @@ class Loop:
     @cached_property
     def classical(self) -> Classical:
         """Disk margins, delay margins and the gang of four."""
-        return classical_margins(self.nominal, [s.name for s in self.plant.outputs])
+        sensors = [s.name for s in self.plant.outputs]
+        return classical_margins(self.nominal, sensors, [s.unit for s in self.plant.inputs])
 
     def uncertain(self, names: Sequence[str]) -> tuple[UncertainSystem, Compensator]:
         """The loop at rest under its loads in parameters by name: the arguments of malta.robust_margin and its like.
@@ -204,7 +205,7 @@ def loop(
     """Make the loop of a machine and a controller at an operating point.
 
     plant : the machine; or a LinearModel of it, which brings its operating point
-    controller : its controller
+    controller : its controller; or a control.StateSpace of the errors, as `malta.synthesis.controller_of` takes it
     parameters : of the machine that differ, by name, SI; the controller keeps what it believes
     current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag",
         first-order lags at their crossover
@@ -221,12 +222,16 @@ def loop(
     >>> f"slowest pole {heavy.poles.real.max():.2f} rad/s"
     'slowest pole -9.89 rad/s'
     """
+    model = plant
+    plant = given_plant("loop", model)
+    if hasattr(controller, "dt"):  # a system of python-control
+        from malta.synthesis.state_space import controller_of
+
+        controller = controller_of(controller, plant)
+    controller = given_law("loop", controller)
     design = controller.operating_point[0]
-    if isinstance(plant, LinearModel):
-        model = plant
-        plant, design = model.plant, model.operating_point.x[list(model.plant.controlled)]
-    if not isinstance(plant, Plant):
-        raise InputError("loop", "plant", f"a {type(plant).__name__}", "a Plant or a LinearModel")
+    if isinstance(model, LinearModel):
+        design = model.operating_point.x[list(plant.controlled)]
     chosen_loops(plant, controller, current_loops)
     require_known(parameters or (), units_of(plant.parameters), "loop", found="an unknown parameter")
     machine = with_parameters(plant, replace(plant.parameters, **parameters)) if parameters else plant
@@ -251,14 +256,18 @@ def loop_along(plant: Plant, controller: Controller, position: float | None = No
     return _cached_loop(plant, controller, tuple(at.items()))
 
 
-def loop_from(source: Plant | Loop, controller: Controller | None, position: float | None = None) -> Loop:
+def loop_from(
+    source: Plant | LinearModel | Loop, controller: Controller | None, position: float | None = None
+) -> Loop:
     """The loop that a function was given: as it is, or of a plant and its controller. Raises InputError."""
     if isinstance(source, Loop) and controller is None and position is None:
         return source
     if isinstance(source, Loop) or controller is None:
         found = "none" if controller is None else "one beside a Loop"
         raise InputError("loop", "controller", found, "a Loop, or a plant and its controller")
-    return loop_along(source, controller, position)
+    if isinstance(source, LinearModel) and position is None:
+        return loop_of_model(source, controller)
+    return loop_along(given_plant("loop", source), controller, position)
 
 
 @lru_cache(maxsize=32)  # what is asked of a loop is computed once; plants and controllers compare by identity

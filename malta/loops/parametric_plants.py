@@ -68,7 +68,7 @@ def of_plant(
     Raises InputError for unknown names and for parameters that set the size of the model.
     """
     par = plant.parameters
-    _check_names(plant, names)
+    check_names(plant, names)
     if believed is not None and believed.actuator.tabulated:
         found = "a controller that looks up a table"
         raise InputError("uncertain", "believed", found, "one whose currents are a formula")
@@ -113,8 +113,6 @@ def of_plant(
         A, B, C = with_windings(in_symbols(plant, symbols), windings, x, A, B, C)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
-    bounds = {f.name: limits_of(f.metadata) for f in fields(par)}
-    limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     if short is None:
         matrices, above = without_branches(matrices, nominal)
@@ -126,7 +124,7 @@ def of_plant(
     why = unproven(plant, tuple(x0.tolist())) or why
     return UncertainSystem(
         tuple(names), readonly(nominal), matrices,
-        limits=limits, approximate=why, positive=positive, ends=tuple(c.ends for c in conditions),
+        limits=declared_limits(par, names), approximate=why, positive=positive, ends=tuple(c.ends for c in conditions),
     )  # fmt: skip
 
 
@@ -188,7 +186,7 @@ def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> Sensors:
     return sensors
 
 
-def _check_names(plant: Plant, names: Any) -> None:
+def check_names(plant: Plant, names: Any) -> None:
     """Raise InputError unless the names are those of parameters that may be symbols, or of the stroke."""
     known = [*units_of(plant.parameters), *((plant.stroke.name,) if plant.has_stroke else ())]
     if not isinstance(names, tuple | list):
@@ -329,6 +327,12 @@ def model_of(
     keep = list(plant.controlled)
     parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, acting]
     return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
+
+
+def declared_limits(par: Any, names: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """The exclusive limits of parameters by name; infinite ones of the stroke."""
+    bounds = {f.name: limits_of(f.metadata) for f in fields(par)}
+    return tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
 
 
 def limits_of(declared: Mapping[str, Any]) -> tuple[float, float]:

@@ -30,8 +30,8 @@ from malta.arrays import FloatArray
 from malta.linear import rational_tables as rational
 from malta.linear.branches import SYMBOLS, resolve_branches
 from malta.linear.expressions import MatrixProgram, NotAnalytic, program
-from malta.linear.implicit import call, implicit_function
 from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
+from malta.linear.roots import call, implicit_function
 from malta.model.equilibrium import rates_at_rest
 from malta.model.parameters import symbolic_names
 from malta.model.plant import OperatingPoint, Plant, symbolic

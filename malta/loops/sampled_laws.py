@@ -76,15 +76,24 @@ def sampled_law(
     if controller.observed:
         summed = _integrals_last(law, m)
         law, p = (law, 0) if summed is None else (summed, m)
-    if held is not None:
-        law = law._replace(D_y=law.D_y + pad(held, law.D_y.shape[1]))
-    if handed:
-        law = with_readings(law, len(controller.measurements))
+    law = with_held_currents(law, held, len(controller.measurements) if handed else 0)
     c = Compensator(
         law.A, law.B_y, law.C, law.D_y,
         integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,
     )  # fmt: skip
     return c if control is None else with_current_control(c, control, late)
+
+
+def with_held_currents(law: LinearLaw, held: FloatArray | None, handed: int) -> LinearLaw:
+    """The law with what readings do beside it: v + held y acts, and the first `handed` readings are passed on."""
+    if held is not None:
+        law = law._replace(D_y=law.D_y + pad(held, law.D_y.shape[1]))
+    return with_readings(law, handed) if handed else law
+
+
+def total_delay(plant: Plant, Ts: float) -> float:
+    """Samples from a motion to its force: a delay of all readings is one of all forces."""
+    return whole_or_not(plant.actuator.delay(Ts) + plant.sensors.dead_time / Ts)
 
 
 def _integrals_last(law: LinearLaw, count: int) -> LinearLaw | None:
@@ -131,11 +140,9 @@ def machine_law(
     whole samples.
     """
     a = plant.actuator
-    delay = a.delay(controller.sample_time)
     if chosen_loops(plant, controller, current_loops) == "lag":
-        # A delay of all readings is one of all forces.
-        late = plant.sensors.dead_time / controller.sample_time
-        return sampled_law(controller, whole_or_not(delay + late), a.crossover, use=use)
+        return sampled_law(controller, total_delay(plant, controller.sample_time), a.crossover, use=use)
+    delay = a.delay(controller.sample_time)
     late = whole_samples(plant, controller.sample_time)
     believed = plant_of(controller.parameters)
     point = plant.at() if point is None else point

@@ -199,7 +199,7 @@ def sampled_loop(
     if caught is not None:
         Cd = np.eye(len(Ad))[first : first + len(C)]
     if late:
-        Ad, Bd, Cd = _stored_readings(Ad, Bd, Cd, late)
+        Ad, Bd, Cd = stored_readings(Ad, Bd, Cd, late)
         true = None if true is None else pad(true, len(Ad))
     if model.E.any():
         law = with_readings(law)
@@ -222,9 +222,11 @@ def _between_samples(
 
 @lru_cache(maxsize=4)  # a loop has it twice, with and without forecast voltages; records compare by identity
 def _sample_windings(
-    model: LinearModel, controller: Controller, delay: float, sensors: bool
+    model: LinearModel, controller: Controller, delay: float, sensors: bool, within: float = 0.0
 ) -> tuple[FloatArray, FloatArray, FloatArray, CurrentControl]:
     """The machine with its windings between samples; sampled behind its current controllers; and these.
+
+    within : s, time of a sample at which the states of the design model are caught; 0: what sensors catch
 
     Under load the link's voltage is a state. The voltages that the law forecasts, M^+ emf(x_hat), are inputs of the
     sampled machine after its forces.
@@ -242,11 +244,40 @@ def _sample_windings(
         B, phi, share = np.vstack([B, link.by_w[None]]), pad(phi, len(A)), link.share
     rest = split_dead_time(plant.sensors.dead_time, Ts)[1] if sensors else 0.0
     caught = Caught(pad(C[:-m], len(A)), Ts - rest) if rest else None
+    if within:
+        caught = Caught(np.eye(len(model.A), len(A)), within)
     Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share, caught)
     return readonly(A), readonly(Ad), readonly(Bd), control
 
 
-def _stored_readings(
+def states_within(
+    model: LinearModel, controller: Controller, loop: SampledLoop, current_loops: CurrentLoops, time: float
+) -> FloatArray:
+    """The states of the design model at a time within a sample, s, of those of `loop.closed` at its beginning.
+
+    model, controller, current_loops : of which the loop is `machine_loop`
+    """
+    n, plant, Ts = len(model.A), model.plant, loop.sample_time
+    if time == 0:
+        return np.eye(n, len(loop.closed))
+    delay, known = plant.actuator.delay(Ts), 0 if loop.caught is None else len(loop.caught[1].C)
+    model = commanded_model(model, controller)
+    if chosen_loops(plant, controller, current_loops) == "pi":
+        _, Ad, Bd, _ = _sample_windings(model, controller, delay, sensors=True, within=time)
+        after = len(Ad) - n - len(controller.forces)
+    else:
+        A, B, _, _ = _between_samples(model, sensors=True)
+        if math.isfinite(plant.actuator.crossover):
+            A, B = add_lags(A, B, plant.actuator.crossover)
+        Ad, Bd = Caught(np.eye(n, len(A)), time).add_to((A, B), Ts, delay)
+        after = len(Ad) - n
+    rows, into = Ad[after : after + n], Bd[after : after + n, : loop.Bd.shape[1]]
+    rows = np.hstack([rows[:, :after], np.zeros((n, known)), rows[:, after + n :]])
+    rows, law = pad(rows, len(loop.Ad)), loop.control
+    return np.hstack([rows + into @ law.D_y @ loop.Cd, into @ law.C])
+
+
+def stored_readings(
     A: FloatArray, B: FloatArray, C: FloatArray, late: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The sampled machine whose outputs are read `late` samples old: stored readings follow its states."""

@@ -26,7 +26,7 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
 from malta.linear.peaks import of_plane, part_of, peak_gain
 from malta.loops.loop import Loop, loop_along, loop_from
-from malta.loops.sampled_loops import SampledLoop
+from malta.loops.waveforms import bound_any_waveform
 from malta.model.places import position_in
 from malta.model.plant import Plant
 from malta.processes import on_one_thread
@@ -48,6 +48,9 @@ class Deviation:
     output: str
     unit: str
     largest: float
+    any_waveform: (
+        float  # the largest that any load of this amplitude makes, whatever its waveform, at samples
+    )
     left: tuple[float, ...]  # the largest from each time of Recovery.after on
     settled: float  # s, from which it stays within SHARE of the largest; inf: never
     final: float  # what stays
@@ -63,8 +66,9 @@ class Recovery:
     name : of the load
     load : N or N m, by disturbance
     after : s, times after which what is left is looked at
-    outputs : of each output, in SI: `largest` deviation, what is `left` after these times, the time after which it is
-        `settled` (s), the `final` value, and the largest `compliance` over frequency with its `frequency` (rad/s)
+    outputs : of each output, in SI: `largest` deviation, that under `any_waveform` of this amplitude, what is `left`
+        after these times, the time after which it is `settled` (s), the `final` value, and the largest `compliance`
+        over frequency with its `frequency` (rad/s)
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
@@ -134,7 +138,7 @@ def recovery(
     loop = whole.sampled
     unit_loads = loop.answer()
     return tuple(
-        Recovery(name, dict(load), after, _deviations(plant, loop, unit_loads, size, after))
+        Recovery(name, dict(load), after, _deviations(whole, unit_loads, size, after))
         for (name, load), size in zip(loads.items(), sizes, strict=True)
     )
 
@@ -190,10 +194,11 @@ def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> t
 
 
 def _deviations(
-    plant: Plant, loop: SampledLoop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
+    whole: Loop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
 ) -> tuple[Deviation, ...]:
     """What a load does to each output."""
-    answer, Ts = unit_loads.of(load), loop.sample_time
+    plant, loop, answer, Ts = whole.plant, whole.sampled, unit_loads.of(load), whole.sample_time
+    any_waveform = bound_any_waveform(whole, load) if load.any() else np.zeros(len(plant.outputs))
     system = loop.under_load(load)
     peaks = [peak_gain(part_of(system, [k], [0])) for k in range(len(system.C))]
     at = of_plane(np.array([peak.frequency for peak in peaks]), Ts)
@@ -204,6 +209,7 @@ def _deviations(
             output=s.name,
             unit=s.unit,
             largest=float(reached[k, 0]) if moves[k] else 0.0,
+            any_waveform=float(any_waveform[k]) if moves[k] else 0.0,
             left=tuple(float(rest[k, 0]) if moves[k] else 0.0 for rest in left),
             settled=float(settled[k, 0]) if moves[k] else 0.0,
             final=float(answer.final[k, 0]),

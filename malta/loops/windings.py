@@ -80,7 +80,7 @@ def _has_driven_windings(plant: Plant, controller: Controller) -> bool:
     return plant.actuator.windings is not None and controller.current_loop is not None
 
 
-BRAKING_TEXT = "the limited speed at which far errors are approached (`braking`)"
+BRAKING_TEXT = "the limited speed at which far errors are approached (braking)"
 
 
 def left_out(plant: Plant, controller: Controller, current_loops: CurrentLoops = "pi") -> str:

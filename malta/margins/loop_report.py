@@ -6,27 +6,29 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from malta.bound import at_least, at_most
 from malta.display import Curves, Description, display
+from malta.frames import data_frame
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.noise import noise_of
 from malta.loops.time_domain import Recovery, furthest, recovery
 from malta.loops.windings import LAST_STAGE, CurrentLoops, left_out
+from malta.margins.outcome import Outcome
 from malta.margins.travel import NO_EXTENT, NOT_BETWEEN_TEXT, Extent
 from malta.merit_lists import in_groups
-from malta.merits import ROOTS, Merit, figure
+from malta.merits import Merit, figure
 from malta.model.parameters import box_words
 from malta.proof.margin import NOT_PROVEN, Margin
-from malta.synthesis.requirements import Figure, NoiseRms, Payload, Verdict, judge_figure, ratio_of
+from malta.synthesis.requirements import NoiseRms, Payload
 from malta.units import FINE_UNITS
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray
     from malta.loops.classical import Classical, Disk
+    from malta.margins.unmodelled import UnmodelledMargin
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
     from malta.proof.blocks.gain import Gain
@@ -110,92 +112,6 @@ class TravelPlace:
     delay: float  # s, smallest delay margin; NaN where unstable, as peak and disk
 
 
-class Outcome(NamedTuple):
-    """What is asked for and what was found, SI."""
-
-    name: str
-    asked: float | None  # None: as little as the others leave
-    found: float
-    unit: str
-    how: str  # where the figure comes from
-    at_least: bool = False  # asked for from below
-    interval: tuple[float, float] | None = None  # 95 % confidence of a simulated figure
-
-    @property
-    def ratio(self) -> float:
-        """How near its limit: at most 1 where it holds."""
-        asked = math.inf if self.asked is None else self.asked
-        return ratio_of(asked, self.found, at_least=self.at_least)
-
-    @property
-    def nearness(self) -> str:
-        """How near its limit, as a share of it that is never less."""
-        return at_most(self.ratio).percent()
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the bound holds; "undecided" where the interval of a simulated figure has the bound within."""
-        return judge_figure(Figure(self.found, self.how, self.interval), self.asked, at_least=self.at_least)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the figure is within its bound; not where that is undecided."""
-        return self.verdict == "holds"
-
-    @property
-    def words(self) -> str:
-        """Its name, with that of its signal or load as it is: "peak sensitivity", "recovery F_x left"."""
-        base, space, rest = self.name.partition(" ")
-        return base.replace("_", " ") + space + rest
-
-    @property
-    def _scale(self) -> tuple[float, str]:
-        """Factor from SI and unit that readers see: bandwidths in Hz, deviations in um."""
-        if self.unit == "rad/s":
-            return 1 / (2 * math.pi), "Hz"
-        fine = FINE_UNITS.get(self.unit)
-        return (1e6, fine) if fine else ROOTS.get(self.unit, (1.0, self.unit))
-
-    def text(self, value: float) -> str:
-        """A value of it in the unit that readers see; a bandwidth has rad/s beside Hz, a margin is proven."""
-        if self.name == "margin":
-            return at_least(value).percent()
-        factor, unit = self._scale
-        more = f" ({value:.4g} rad/s)" if unit == "Hz" else ""
-        return f"{value * factor:.4g} {unit}".removesuffix(" 1") + more
-
-    @property
-    def asked_text(self) -> str:
-        """Its bound; "as little as possible" without one."""
-        if self.asked is None:
-            return "as little as possible"
-        return f"{'>=' if self.at_least else '<='} {self._as_asked(self.asked)}"
-
-    def _as_asked(self, bound: float) -> str:
-        """A bound of it as the design file has it."""
-        return f"{100 * bound:.10g} %" if self.name == "margin" else self.text(bound)
-
-    @property
-    def found_text(self) -> str:
-        """What was found; of a mean over seeds with half the width of its interval."""
-        if self.interval is None:
-            return self.text(self.found)
-        low, high = self.interval
-        number, space, unit = self.text(self.found).partition(" ")
-        return f"{number} ± {(high - low) / 2 * self._scale[0]:.2g}{space}{unit}"
-
-    def __str__(self) -> str:
-        found = f"{self.name} is {self.text(self.found)}"
-        if self.asked is None:
-            return f"{found}, asked for little"
-        bound = "at least" if self.at_least else "at most"
-        text = f"{found}, asked for {bound} {self._as_asked(self.asked)}"
-        if self.verdict != "undecided" or self.interval is None:
-            return text
-        low, high = map(self.text, self.interval)
-        return f"{text}, undecided between {low} and {high}"
-
-
 @display
 @dataclass(frozen=True, eq=False)
 class LoopReport:
@@ -222,6 +138,7 @@ class LoopReport:
     places : figures along the course, each the worse of +z and -z
     worst : the largest `|S|` of each sensor over the uncertainty, with its proven bound
     payload : kg that the forces hold and the mover carries in flight; None for a machine without a mass m
+    unmodelled : the margin with the dynamics that a log leaves of an identified machine; None: of no log
     requirements : of the design file, with what was found
     notes : what could not be computed, and why
 
@@ -257,6 +174,7 @@ class LoopReport:
     places: tuple[TravelPlace, ...] = ()
     worst: Mapping[str, Gain] = field(default_factory=dict)
     payload: Payload | None = None
+    unmodelled: UnmodelledMargin | None = None
     requirements: tuple[Outcome, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -324,6 +242,17 @@ class LoopReport:
         """The figures of merit, in the order of their groups."""
         slow = (_margins, _complementary, _loads, _requirements)
         return in_groups([*self.quick_figures, *(found for part in slow for found in part(self))])
+
+    def to_pandas(self) -> Any:
+        """The figures of merit as a pandas.DataFrame: by key, with label, value and bound, SI.
+
+        Raises InputError where pandas is not installed.
+        """
+        merits = self.figures
+        columns = {
+            name: [getattr(one, name) for one in merits] for name in ("label", "value", "bound", "note")
+        }
+        return data_frame(columns, ("figure", [one.identifier for one in merits]))
 
     @cached_property
     def quick_figures(self) -> tuple[Merit, ...]:
@@ -448,8 +377,9 @@ def _loads(a: LoopReport) -> Iterator[Merit]:
         size = f"1 {units[load.name]} {load.name}".replace("1 1 ", "1 ")
         settled = f"{size}: within 1 % after"
         peak = f"{size}: largest over frequency"
-        moved = f"{size}: largest deviation"
+        moved, any_waveform = f"{size}: largest deviation", f"any waveform of {size}: at most"
         yield figure("load_moves", f"{name} largest", moved, output.largest, fine, load.name)
+        yield figure("load_any", f"{name} any waveform", any_waveform, output.any_waveform, fine, load.name)
         yield figure("load_settles", f"{name} settles", settled, output.settled, signal=load.name)
         yield figure("compliance", f"{name} compliance", peak, output.compliance, fine, load.name)
 

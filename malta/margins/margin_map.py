@@ -24,7 +24,7 @@ from malta.linear.closed_loops import closed_loop, instability
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import continuous_poles
 from malta.margins.travel import extent_of, travel_loops, travel_margin
-from malta.model.parameters import units_of
+from malta.model.parameters import units_of, words_of
 from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin
@@ -156,6 +156,7 @@ class MarginMap:
     beside : the other uncertain parameters
     others : what these are: "box", anywhere in the box with the margin, or "nominal"
     where : the places that the margin covers, in words
+    words : x and y with the words that the machine declares them with, as "magnet stiffness K_A"
     """
 
     name: str
@@ -171,6 +172,7 @@ class MarginMap:
     beside: tuple[str, ...]
     others: Others
     where: str
+    words: tuple[str, str]
 
     @property
     def proven(self) -> float:
@@ -236,11 +238,12 @@ def margin_map_of(
     proven = 0.0 if margin is None else margin.lower or 0.0
     values = [_values(*of, proven) for of in zip(low, high, nominal, half, strict=True)]
     x, y = names
-    units = units_of(plant.parameters)
+    units, words = units_of(plant.parameters), words_of(plant.parameters)
     return MarginMap(
         controller.name, x, y, (units[x], units[y]), (float(nominal[0]), float(nominal[1])),
         (float(half[0]), float(half[1])), values[0], values[1], plane.growth(*values), margin,
         tuple(name for name in uncertainty if name not in names), others, str(extent_of(plant, box)),
+        (words[x], words[y]),
     )  # fmt: skip
 
 

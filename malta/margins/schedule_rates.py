@@ -21,7 +21,8 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.linear.expressions import BALLS, MatrixProgram, NotAnalytic, program
+from malta.linear.balls import BALLS
+from malta.linear.expressions import MatrixProgram, NotAnalytic, program
 from malta.linear.matrices import system_matrix
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.margins.scheduled_loops import loops_between_places

@@ -33,7 +33,8 @@ from malta.model.places import off_stroke, outputs_at, position_at
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of, within_branches
-from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
+from malta.proof.loss import narrow_loss
+from malta.proof.margin import NOT_BEGUN, NOT_WRITTEN, NOT_WRITTEN_TEXT, Margin, Progress, Ranges
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
     TOLERANCE,
@@ -48,7 +49,7 @@ from malta.proof.robust import (
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.synthesis.law import point_at
-from malta.work import MORE_WORK, WorkUp, count_work
+from malta.work import WorkUp, answer_in_time, count_work
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -229,10 +230,10 @@ PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
 PLACE_WORK = 6.0  # work, of the margin at a position for itself
 ENDS = (0.0, 1.0)  # of those, where no interval is enclosed
 AXES = 0.6  # of the work, for the proof of each axis alone
-NOT_WRITTEN_TEXT = f"the clock ended the search before the model was written out, more time {MORE_WORK}"
 
 
 @on_one_thread
+@answer_in_time(NOT_BEGUN)
 def travel_margin(
     plant: Plant,
     controller: Controller,
@@ -281,7 +282,7 @@ def _margin_along(
         if plant.has_stroke and not over:  # places of the travel, and no other interval
             problem = margin_anywhere(loop)
     except WorkUp:
-        return replace(NOT_PROVEN, reason=NOT_WRITTEN_TEXT)
+        return NOT_WRITTEN
     if problem is not None:
         with count_work(AXES * work):
             found = margin_of(
@@ -299,7 +300,7 @@ def _margin_along(
 
 SCANNED = 129  # places of the travel at which a witness is looked for
 JUST_BEYOND = 1e-3  # of its distance, at which a witness is unstable
-HALVINGS = 24  # of the way to a loss at a position
+RESOLUTION = 2.0**-24  # of the way to a loss at a position
 REACHES = 24  # of boxes beyond a witness that no place has, up to the limit of the search
 NOWHERE_TEXT = "what is unstable has values that no position has together"
 
@@ -322,17 +323,18 @@ def at_a_place(system: UncertainSystem, law: Compensator, box: Box, found: Margi
     def at(t: float, rows: FloatArray) -> FloatArray:
         return box.stretch(rows, t / found.upper) if found.upper else rows
 
+    def rate(place: FloatArray, t: float) -> float:
+        return float(instability(system, law, at(t, place))[0])
+
     last = max(box.limit, 2 * found.upper)
     for t in np.geomspace(found.upper * (1 + JUST_BEYOND), last, REACHES) if found.upper else [0.0]:
         values = instability(system, law, at(t, places))
         if t > box.limit or values.max() < 0:
             continue
-        place, low, high = places[[int(values.argmax())]], found.upper, float(t)
-        for _ in range(HALVINGS if high > low else 0):
-            middle = (low + high) / 2
-            low, high = (
-                (low, middle) if instability(system, law, at(middle, place))[0] >= 0 else (middle, high)
-            )
+        place, high = places[[int(values.argmax())]], float(t)
+        if high > found.upper:
+            width = RESOLUTION * (high - found.upper)
+            high = narrow_loss(partial(rate, place), found.upper, high, width)
         (p,) = at(high, place)
         named = {name: x for name, x in zip(box.names, p.tolist(), strict=True) if name in own}
         moved = {name: x - c for (name, x), c in zip(named.items(), box.nominal.tolist(), strict=False)}
@@ -450,6 +452,7 @@ def _box(system: UncertainSystem, ranges: Ranges, over: Mapping[str, Interval] |
 
 
 @on_one_thread
+@answer_in_time(NOT_BEGUN)
 def place_margin(
     plant: Plant,
     controller: Controller,

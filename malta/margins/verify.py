@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.budget import Budget
 from malta.errors import CheckError, InputError
 from malta.linear.closed_loops import instability
@@ -21,7 +22,14 @@ from malta.linear.matrices import eigenvalues, system_matrix
 from malta.linear.open_loops import open_systems
 from malta.linear.peaks import peak_gain
 from malta.linear.uncertain import Compensator, UncertainSystem
-from malta.loops.bandwidths import last_crossover, peak_of_channels, peak_sensitivity, tracked_band
+from malta.loops.bandwidths import (
+    in_sizes,
+    last_crossover,
+    peak_of_channels,
+    peak_sensitivity,
+    reading_sizes,
+    tracked_band,
+)
 from malta.loops.classical import Classical, Nominal, classical_margins, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.parametric_plants import of_plant
@@ -51,14 +59,14 @@ from malta.model.places import position_at
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
-from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
+from malta.proof.margin import NOT_PROVEN, NOT_WRITTEN_TEXT, Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest, kalman
 from malta.synthesis.regulators import integrals_of, lqi, lqr
 from malta.synthesis.separation import controller_poles
 from malta.synthesis.weighting import weights_of
-from malta.work import count_work
+from malta.work import count_work, without_limit
 
 
 @on_one_thread
@@ -89,13 +97,18 @@ def linear_report(
     return replace(found, uncertainty=dict[str, Any](uncertainty), robust=robust, extent=extent)
 
 
+def _sizes(plant: Plant, controller: Controller) -> FloatArray | None:
+    return reading_sizes(plant, None if controller.noise is None else controller.noise.sensor)
+
+
 def _nominal_report(model: LinearModel, controller: Controller, current_loops: CurrentLoops) -> LoopReport:
     loops = {
         "sampled": sampled_loop(model, controller, delay=controller.delay),
         "+ current loops": sampled_loop(model, controller, delay=controller.delay, current_loops="lag"),
     }
     names = [s.name for s in controller.measurements]
-    stages = tuple(stage_of(name, stage, names) for name, stage in loops.items())
+    sizes = _sizes(model.plant, controller)
+    stages = tuple(stage_of(name, stage, names, sizes) for name, stage in loops.items())
     found = machine_report(model, controller)
     return replace(found, stages=(*stages, *found.stages), current_loops=current_loops)
 
@@ -103,7 +116,8 @@ def _nominal_report(model: LinearModel, controller: Controller, current_loops: C
 def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
     """The report of the machine's loop alone, without the stages before it: what a page shows at each move."""
     whole = loop_of_model(model, controller)
-    stage = stage_of("machine", whole.sampled, [s.name for s in controller.measurements])
+    sizes = _sizes(model.plant, controller)
+    stage = stage_of("machine", whole.sampled, [s.name for s in controller.measurements], sizes)
     empty = np.zeros(0, dtype=complex)
     regulator, observer = (empty, empty) if controller.cost is None else controller_poles(controller)
     poles = Poles(
@@ -118,15 +132,18 @@ def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
     )
 
 
-def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> StagePeak:
-    """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN."""
+def stage_of(name: str, stage: SampledLoop, sensors: list[str], sizes: FloatArray | None = None) -> StagePeak:
+    """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN.
+
+    sizes : in which the largest singular value has the readings, see `reading_sizes`
+    """
     radius = stage.spectral_radius
     if radius >= 1:
         return StagePeak(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
 
     cut = stage.cut
     peaks = {name: peak_gain(cut.sensitivity(i)).value for i, name in enumerate(sensors)}
-    largest = peak_of_channels(cut, cut.sensors)
+    largest = peak_of_channels(in_sizes(cut, sizes), cut.sensors)
     return StagePeak(name, peaks | {"sigma_max": largest.value}, largest.frequency, radius)
 
 
@@ -137,8 +154,9 @@ def bandwidths_of(
     natural = _natural_frequencies(commanded_model(model, controller), controller)
     if not stable:
         return {key: np.nan for key in BANDWIDTHS if not key.startswith("w_n")} | natural
-    lowest, highest = tracked_band(machine.cut, min(len(machine.Cd), len(controller.forces)))
-    crossover = last_crossover(machine.cut)
+    cut = in_sizes(machine.cut, _sizes(model.plant, controller))
+    lowest, highest = tracked_band(cut, min(len(machine.Cd), len(controller.forces)))
+    crossover = last_crossover(cut)
     return {"sigma_max_T": highest, "sigma_min_T": lowest, "crossover_max": crossover} | natural
 
 
@@ -258,7 +276,8 @@ class _Question:
 
     def margin_at(self, position: float) -> Margin:
         """The margin at a position along the course; computed once if the loop does not depend on the position."""
-        z, known = position if self.loop.depends_on_course else 0.0, self._place_margins
+        with without_limit():
+            z, known = position if self.loop.depends_on_course else 0.0, self._place_margins
         if z not in known:
             travel = self._travel_margins.get((tuple(self.uncertainty.items()), False))
             known[z] = place_margin(
@@ -325,6 +344,8 @@ def staged_report(
     loop = LoopAlong(plant, found.controller, names, found.current_loops)
     question = _Question(loop, uncertainty, time, proof, report)
     travel = question.margin_over(uncertainty, progress=bounds) if proof else None
+    if travel is not None and travel.reason == NOT_WRITTEN_TEXT:  # nor is there time for the other margins
+        return replace(found, uncertainty=dict[str, Any](uncertainty), robust=travel)
     links = _links(question)
     tolerance, mass = _tolerances(question) if proof else ({}, None)
     places, worst = _places(question)
@@ -362,14 +383,16 @@ def _links(q: _Question) -> tuple[ChainStage, ...]:
         if own:
             stage = q if name == last else replace(q, loop=replace(q.loop, current_loops="lag"))
             position = own_position(q.plant, q.loop.whole_extent, at, q.controller)
-            loop = stage.loop.under_load(position)
+            with without_limit():
+                loop = stage.loop.under_load(position)
             margin = stage.margin_at(position) if q.proof else NOT_PROVEN
         else:
-            system = of_plant(
-                q.plant, list(q.uncertainty), states=states, at=at, believed=believed, loaded=False
-            )
+            with without_limit():
+                system = of_plant(
+                    q.plant, list(q.uncertainty), states=states, at=at, believed=believed, loaded=False
+                )
+                loop = nominal_loop(system, law)
             margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
-            loop = nominal_loop(system, law)
         where: Literal["forces", "sensors"] = "forces" if states else "sensors"
         links.append(ChainStage(name, margin, peak_sensitivity(loop, where), where, loaded=own))
         q.report()
@@ -398,15 +421,16 @@ def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin 
 
 def _places(q: _Question) -> tuple[tuple[TravelPlace, ...], Classical | None]:
     """The places along the course, and the worst of their classical margins; None where one of them is unstable."""
-    sensors = [s.name for s in q.plant.outputs]
+    sensors, units = [s.name for s in q.plant.outputs], [s.unit for s in q.plant.inputs]
     places: list[TravelPlace] = []
     classical: list[Classical | None] = []
     for positions in q.loop.places:
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
         margin = smallest_margin([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
-        loops = [q.loop.under_load(z) for z in positions]
+        with without_limit():
+            loops = [q.loop.under_load(z) for z in positions]
         peak = float(np.max([peak_sensitivity(loop, "sensors") for loop in loops]))
-        sides = [classical_margins(loop, sensors) if loop.stable else None for loop in loops]
+        sides = [classical_margins(loop, sensors, units) if loop.stable else None for loop in loops]
         classical += sides
         worst = worst_of(sides)
         disk, delay = (worst.disks[2].size, min(worst.delay.values())) if worst else (np.nan, np.nan)

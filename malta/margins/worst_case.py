@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 from malta.errors import InputError
 from malta.loops.windings import LAST_STAGE, CurrentLoops
+from malta.margins.travel import travel_loops
 from malta.processes import on_one_thread
 from malta.proof.margin import Ranges
+from malta.work import is_stopped
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
-from malta.margins.travel import travel_loops
 
 
 @on_one_thread
@@ -32,6 +33,7 @@ def worst_sensitivities(
     at : the sensors, or the forces in their place
 
     The others are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
+    Sensors for which the clock leaves no time are left out.
     """
     if controller.schedule is not None:
         raise InputError("worst_case", controller.name, "a scheduled law", "a law of one set of matrices")
@@ -40,8 +42,10 @@ def worst_sensitivities(
     )
 
     along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
-    found = {}
+    found: dict[str, Gain] = {}
     for k, signal in enumerate(plant.outputs if at == "sensors" else plant.inputs):
+        if is_stopped():
+            break
         each = [worst_case_gain(*loop, ranges, over, at=at, channel=k, time=time) for loop in along]
         worst = max(each, key=lambda gain: gain.lower)
         proven = [gain.upper for gain in each if gain.upper is not None]

@@ -11,26 +11,47 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.display import quantity
 from malta.errors import InputError
 from malta.model.faults import fault_of
 from malta.model.parameters import symbolic_names
-from malta.model.plant import Plant, outputs_themselves, symbolic
+from malta.model.plant import Plant, Signal, outputs_themselves, symbolic
+
+SIGNALS = ("states", "inputs", "outputs", "disturbances")
+BY_SENSOR = ("sensors.lag", "sensors.noise", "sensors.resolution", "sensors.range")
+LEAST_RANGE = 6  # of a sensor, in standard deviations of its noise
+TIMES = ("sensors.dead_time", "actuator.dead_time", "actuator.computation_time")
+
+
+def _check_forms(plant: Plant) -> None:
+    """Raise InputError for one signal or number where there may be several, and for several where there is one."""
+    for key in SIGNALS:
+        given = attrgetter(key)(plant)
+        if not isinstance(given, tuple | list) or not all(isinstance(s, Signal) for s in given):
+            found = repr(given) if len(repr(given)) < 60 else f"a {type(given).__name__}"
+            raise InputError(plant.name, key, found, 'Signals in a tuple, as (Signal("u", "V"),)')
+    for key in (*BY_SENSOR, "inertia"):
+        given = attrgetter(key)(plant)
+        if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray):
+            of = "inputs" if key == "inertia" else "outputs"
+            raise InputError(plant.name, key, repr(given), f"a tuple, a number for each of the {of}")
+    for key in TIMES:
+        given = attrgetter(key)(plant)
+        if isinstance(given, str | Sequence):
+            raise InputError(plant.name, key, repr(given), "one number, s")
 
 
 def check_signals(plant: Plant) -> None:
     """Raise InputError unless the names and lengths of a plant's fields fit each other."""
-    names = {
-        key: [s.name for s in attrgetter(key)(plant)]
-        for key in ("states", "inputs", "outputs", "disturbances", "sensors.errors")
-    }
+    _check_forms(plant)
+    names = {key: [s.name for s in attrgetter(key)(plant)] for key in (*SIGNALS, "sensors.errors")}
     for key, own in names.items():
         if len(set(own)) < len(own):
             raise InputError(plant.name, key, " ".join(own), "names that differ")
     for key in ("states", "inputs", "outputs"):
         if not names[key]:
             raise InputError(plant.name, key, "none", "at least one")
-    by_sensor = ("sensors.lag", "sensors.noise", "sensors.resolution", "sensors.range")
-    for key, of in {**dict.fromkeys(by_sensor, "outputs"), "inertia": "inputs"}.items():
+    for key, of in {**dict.fromkeys(BY_SENSOR, "outputs"), "inertia": "inputs"}.items():
         found = f"{len(attrgetter(key)(plant))} entries"
         if len(attrgetter(key)(plant)) != len(names[of]):
             raise InputError(plant.name, key, found, f"{len(names[of])}, one for each of the {of}")
@@ -61,11 +82,18 @@ def check_signals(plant: Plant) -> None:
 
 
 def _check_ranges(plant: Plant) -> None:
-    """Raise InputError for a range of a sensor that is no size, as a pair or a number below 0."""
-    for s, most in zip(plant.outputs, plant.sensors.range, strict=True):
-        if isinstance(most, Sequence | np.ndarray) or (isinstance(most, Real) and not 0 <= most < math.inf):
+    """Raise InputError for a range of a sensor that is no size, as a pair, or that its noise fills: of another unit."""
+    for s, most, noise in zip(plant.outputs, plant.sensors.range, plant.sensors.noise, strict=True):
+        none = most is None or isinstance(most, Sequence | np.ndarray)
+        if none or (isinstance(most, Real) and not 0 <= most < math.inf):
             expected = f"its largest reading either way, {s.unit}, or 0: not declared"
             raise InputError(plant.name, f"sensors.range: {s.name}", repr(most), expected)
+        if isinstance(most, Real) and isinstance(noise, Real) and 0 < most < LEAST_RANGE * noise:
+            found = (
+                f"{quantity(float(most), s.unit)}, which its noise of {quantity(float(noise), s.unit)} fills"
+            )
+            expected = f"its largest reading either way, {s.unit}, at least {LEAST_RANGE} times its noise"
+            raise InputError(plant.name, f"sensors.range: {s.name}", found, expected)
 
 
 def _check_intervals(plant: Plant) -> None:

@@ -37,6 +37,16 @@ class Sourced(Quantity):
     )
 
 
+class UnmodelledTable(Record):
+    """A bound of the dynamics that an identified machine lacks: of (Y - G I) over G I, readings over their sizes."""
+
+    frequency: list[Finite] = entry("of the excited lines, Hz")
+    bound: list[Finite] = entry("of the deviation there, beside noise, with 95 % at all lines")
+    sizes: list[Finite] = entry("of the readings, SI")
+    shares: list[Finite] = entry("of the bound, by which each reading may deviate")
+    between: StrictStr = entry("why the bound does not hold between lines", default="")
+
+
 class IdentifiedTable(Record):
     """What a data file says of the identification that its parameters come from."""
 
@@ -45,7 +55,11 @@ class IdentifiedTable(Record):
     chi2: Finite = entry("of the residuals over their degrees of freedom")
     joint: Finite = entry("times the intervals: the box that holds all parameters together with 95 %")
     names: list[StrictStr] = entry("the identified parameters")
+    noise: list[Finite] = entry("by parameter: half of the interval that noise alone leaves, SI", default=[])
+    left: Finite = entry("share of the response at the lines that nothing explains", default=0.0)
+    verdict: StrictStr = entry("what explains the log, and whether S is as predicted", default="")
     correlation: list[list[Finite]] = entry("of the parameters, in the order of names")
+    unmodelled: UnmodelledTable | None = entry("a bound of the dynamics that the machine lacks", default=None)
 
 
 class MachineFile(Record):

@@ -18,7 +18,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError
 from malta.model.currents import command_symbols, currents_at, currents_of
-from malta.model.plant import OperatingPoint, Plant
+from malta.model.plant import OperatingPoint, Plant, given_plant
 from malta.model.traced import Traced, trace
 
 Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -170,6 +170,7 @@ def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
     >>> held.u.round(3).tolist(), held.v.round(3).tolist()  # N: acting, commanded
     ([0.981], [-0.523])
     """
+    plant = given_plant("trim", plant)
     point = balance(plant, plant.state(positions))
     excess = exceeded_limit(plant, point)
     if excess:

@@ -13,7 +13,7 @@ from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.model.currents import _clearance, _limits
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, has_feedthrough
+from malta.model.plant import Plant, given_plant, has_feedthrough
 from malta.model.readings import Observation, read_outputs, rooms_of, sensor_rows, symbols_of
 from malta.model.soundness import (
     KINK,
@@ -78,6 +78,7 @@ def inspect(plant: Plant) -> Inspection:
       actuator.currents  not the inverse of `forces` along q, by 103 % of the lim...
       switch             q: none from -0.002 to 0.002 m
     """
+    plant = given_plant("inspect", plant)
     rows = [*sensor_rows(plant), *kink_rows(plant, plant.at().x), *uncontrolled_rows(plant, plant.at().x)]
     rows += [*_inverse_rows(plant), *_unit_rows(plant), *_idle_rows(plant)]
     return Inspection(plant.name, tuple(rows), tuple(_switches(plant)))

@@ -20,7 +20,7 @@ from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.linear.system import System
 from malta.model.equilibrium import with_command
-from malta.model.plant import OperatingPoint, Plant
+from malta.model.plant import OperatingPoint, Plant, given_plant
 from malta.model.readings import require_readings
 from malta.model.traced import trace
 
@@ -119,6 +119,7 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     >>> sorted(model.sys.poles().real.round(1).tolist())  # rad/s
     [-120.0, 120.0]
     """
+    plant = given_plant("linearize", plant)
     n, m = len(plant.states), len(plant.inputs)
     if point.x.shape != (n,) or point.u.shape != (m,):
         raise InputError(

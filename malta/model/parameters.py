@@ -42,7 +42,7 @@ def si(
 ) -> Any:
     """Declare a parameter of a machine: a field of its frozen dataclass Parameters.
 
-    unit : the SI unit, "1" for a pure number
+    unit : the SI unit, "1" for a pure number; with words before it in brackets, as "magnet stiffness [N/m]"
     above : the lower limit of the value, exclusive
     at_least : the lower limit of the value, inclusive
     below : the upper limit of the value, exclusive
@@ -57,14 +57,16 @@ def si(
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True)
     ... class Parameters:
-    ...     m: float = malta.model.si("kg", above=0)  # sphere
+    ...     m: float = malta.model.si("mass of the sphere [kg]", above=0)
     ...     C: float = malta.model.si("N m^2/A^2", above=0)  # constant of each magnet
     ...     preset: str = "custom"
     >>> Parameters(m=0.1, C=2e-5)
     Parameters(m=0.1, C=2e-05, preset='custom')
     """
     limits = {"above": above, "at_least": at_least, "below": below}
-    known = {"unit": unit, **limits, "twin": twin, "shapes": shapes}
+    words, bracket, rest = unit.rpartition("[")
+    unit, words = (rest.rstrip(" ]"), words.strip()) if bracket else (unit, "")
+    known = {"unit": unit, "words": words, **limits, "twin": twin, "shapes": shapes}
     if default is None:
         return field(metadata=known)
     return field(default=float(default), metadata=known | {"later": True})
@@ -73,6 +75,16 @@ def si(
 def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
     """The SI unit of every physical field of a parameter record."""
     return {f.name: f.metadata["unit"] for f in fields(record) if "unit" in f.metadata}
+
+
+def words_of(record: type[Parameters] | Parameters) -> dict[str, str]:
+    """Every physical field with the words that it is declared with before its name: "magnet stiffness K_A".
+
+    >>> from malta.machines.tubular.parameters import Parameters
+    >>> words_of(Parameters)["K_A"], words_of(Parameters)["I_max"]
+    ('magnet stiffness K_A', 'I_max')
+    """
+    return {f.name: f"{f.metadata['words']} {f.name}".strip() for f in fields(record) if "unit" in f.metadata}
 
 
 def later_parameters(record: type[Parameters] | Parameters) -> dict[str, float]:

@@ -13,6 +13,8 @@ from malta.arrays import FloatArray
 if TYPE_CHECKING:
     from malta.model.plant import Plant
 
+MIN_SLOPE = 1e-6  # of a reading at rest over what is asked for, below which it does not follow
+
 
 def place_states(plant: Plant, design: Any) -> Any:
     """All states as an expression: these first ones of the design model, the others zero. design : a CasADi column"""
@@ -34,6 +36,22 @@ def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
 def outputs_at(plant: Plant, x: ArrayLike) -> FloatArray:
     """The outputs at rest at the states x, without sensors' errors."""
     return np.array(ca.DM(plant.h(ca.DM(np.asarray(x, dtype=float)), 0)), dtype=float).ravel()
+
+
+def holdable_outputs(plant: Plant) -> tuple[int, ...]:
+    """The outputs that a machine at rest can be at, by h and `position_of`: no accelerations, and no rates.
+
+    Of outputs that say the same, as a position and the current that holds it, those that `position_of` reads; all where
+    none is left.
+    """
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
+    p = kind.sym("p", len(plant.outputs))
+    read = ca.vertcat(plant.h(place_states(plant, ca.densify(plant.position_of(p))), 0))
+    slope = np.array(
+        ca.Function("slope", [p], [ca.densify(ca.jacobian(read, p))])(np.zeros(len(plant.outputs)))
+    )
+    found = np.flatnonzero(np.abs(np.diag(slope)) > MIN_SLOPE)
+    return tuple(found.tolist() or range(len(plant.outputs)))
 
 
 def off_stroke(plant: Plant, x: ArrayLike) -> dict[str, float]:

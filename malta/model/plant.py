@@ -123,6 +123,8 @@ class Plant:
                 if group:
                     record, entry, value = self, group, replace(record, **{entry: value})
                 object.__setattr__(record, entry, value)
+        if getattr(self.load, "func", None) not in (_zeros, _column):
+            object.__setattr__(self, "load", partial(_column, self.load))
 
     @property
     def drive(self) -> Drive:
@@ -348,6 +350,11 @@ def _zeros(size: int, x: Any) -> Any:
     return type(x).zeros(size) if isinstance(x, ca.SX | ca.MX | ca.DM) else ca.DM.zeros(size)
 
 
+def _column(load: CasadiFn, x: Any) -> Any:
+    """The loads as a column, of a plain number or a list too, so that `f` may take w[0] of them."""
+    return ca.vertcat(load(x))
+
+
 def outputs_themselves(y: Any) -> Any:
     """The default of `position_of`: the outputs are the positions."""
     return y
@@ -428,3 +435,11 @@ def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:
     for f in fields(parameters):
         object.__setattr__(record, f.name, symbols.get(f.name, getattr(parameters, f.name)))
     return record
+
+
+def given_plant(caller: str, given: Any) -> Plant:
+    """The machine of an argument: a Plant, or that of a LinearModel. Raises InputError for anything else."""
+    plant = given.plant if hasattr(given, "operating_point") and hasattr(given, "plant") else given
+    if not isinstance(plant, Plant):
+        raise InputError(caller, "plant", f"a {type(plant).__name__}", "a Plant or a LinearModel")
+    return plant

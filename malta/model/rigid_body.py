@@ -39,7 +39,7 @@ class Body(NamedTuple):
     """A body of a machine as pictures show it; nothing is computed of it.
 
     name : as "mover"
-    form : "box", or "cylinder", whose axis is z
+    form : "box", "cylinder", whose axis is z, or "sphere"
     size : along x, y and z, m
     place : of its middle, m, beside what it moves by
     moves : states that move it along x, y, z and turn it by Cardan angles about them, "" for none; (): it stands still
@@ -52,7 +52,7 @@ class Body(NamedTuple):
     """
 
     name: str
-    form: Literal["box", "cylinder"]
+    form: Literal["box", "cylinder", "sphere"]
     size: tuple[float, float, float]
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
     moves: tuple[str, ...] = ()

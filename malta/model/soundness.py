@@ -29,6 +29,9 @@ KINK = 1e-3  # of a slope, by which those of both sides differ
 SIZES = np.reshape((2.0, 1.0, 0.5, 0.25), (-1, 1, 1))  # of the steps to each side
 NOISES, ROOM_SHARE = 3.0, 1e-5  # steps: of the noise of a reading, of the room to the first contact
 ROUNDING = 1e-9
+CLOSE_STEPS = 0.25 * (1 + 0.01 * np.arange(8))  # their third differences are rounding
+ROUNDING_SHARE = 12.0  # a slope's error by rounding, in third differences of values
+MAX_LENGTHENINGS = 4  # of a step that rounding loses, each to ten times
 
 
 @lru_cache(maxsize=64)  # plants compare by identity
@@ -83,13 +86,38 @@ def _kink(plant: Plant, point: Any, loaded: bool) -> str:
     mixed[:, [k for k in range(n) if k not in plant.controlled]] = 0
     along = np.vstack([np.diag(steps)[moving], mixed])
     z = np.concatenate([point.x, read_outputs(plant, point.x)[0], point.v])
-    shifts = np.outer(SIZES, (1.0, -1.0)).ravel()
+    sides, found, lost = _kinks(plant, loaded, z, along)
+    for _ in range(MAX_LENGTHENINGS):  # steps that rounding loses, as one of 1e-8 Pa beside 1e5 Pa
+        if not lost.any():
+            break
+        along[lost] *= 10
+        sides, found, lost = _kinks(plant, loaded, z, along)
+    if not found.any():
+        return ""
+    found[len(moving) :] *= KINK**2  # one signal is named rather than several
+    d, k = np.unravel_index(int(found.argmax()), found.shape)
+    names = [s.name for s in (*plant.states, *plant.outputs, *plant.inputs)]
+    single = d < len(moving)
+    slopes = (side[d, k] / (along[d, moving[d]] if single else 1.0) for side in sides)
+    of = f"{names[k]}'" if k < n else names[k]
+    words = (of, names[moving[d]] if single else "several signals", *slopes)
+    return "{} along {} is {:.4g} to the left and {:.4g} to the right".format(*words)
+
+
+def _kinks(plant: Plant, loaded: bool, z: FloatArray, along: FloatArray) -> tuple[Any, FloatArray, Any]:
+    """Slopes to the left and right along some steps, the share by which they differ, and the steps that are lost.
+
+    The shares are 0 where there is no kink. A step is lost where rounding hides or makes a kink: third differences of
+    points that are close to each other show it.
+    """
+    shifts = np.concatenate([np.outer(SIZES, (1.0, -1.0)).ravel(), CLOSE_STEPS])
     rows = np.vstack([z, *(z + shift * along for shift in shifts)])
     values = trace(motion_of, plant, None, loaded).each(rows)[0].T
+    moved = (values[1:] - values[0]).reshape(len(shifts), len(along), -1)
     if not np.isfinite(values).all():
-        return ""
-    moved = (values[1:] - values[0]).reshape(len(SIZES), 2, len(along), -1)
-    right, left = moved[:, 0] / SIZES, -moved[:, 1] / SIZES
+        return (moved[0], moved[0]), np.zeros_like(moved[0]), np.zeros(len(along), bool)
+    both = moved[: -len(CLOSE_STEPS)].reshape(len(SIZES), 2, *moved.shape[1:])
+    right, left = both[:, 0] / SIZES, -both[:, 1] / SIZES
     jump = right - left
     weights = np.array([1 / 3, -2.0, 8 / 3])  # of steps h, h / 2, h / 4: terms of h and h^2 are gone
     coarse, fine = (np.tensordot(weights, jump[k : k + 3], 1) for k in (0, 1))
@@ -100,17 +128,9 @@ def _kink(plant: Plant, point: Any, loaded: bool) -> str:
     growth = np.max([np.abs(d[2]) * is_growing for d, is_growing in zip(steep, grows, strict=True)], axis=0)
     least = np.maximum(KINK * size, MIN_SHARE * size.max(axis=0))
     is_kink = (np.abs(fine) > least) & (ratio > 0.3) & (ratio < 3) | (growth > least)
-    if not is_kink.any():
-        return ""
-    sharp = np.where(is_kink, np.maximum(np.abs(fine), growth) / np.maximum(size, 1e-300), 0)
-    sharp[len(moving) :] *= KINK**2  # one signal is named rather than several
-    d, k = np.unravel_index(int(sharp.argmax()), fine.shape)
-    names = [s.name for s in (*plant.states, *plant.outputs, *plant.inputs)]
-    single = d < len(moving)
-    sides = (side[-1][d, k] / (steps[moving[d]] if single else 1.0) for side in (left, right))
-    of = f"{names[k]}'" if k < n else names[k]
-    found = (of, names[moving[d]] if single else "several signals", *sides)
-    return "{} along {} is {:.4g} to the left and {:.4g} to the right".format(*found)
+    rounding = ROUNDING_SHARE * np.abs(np.diff(moved[-len(CLOSE_STEPS) :], 3, axis=0)).max(axis=0)
+    share = np.where(is_kink, np.maximum(np.abs(fine), growth) / np.maximum(size, 1e-300), 0)
+    return (left[-1], right[-1]), share, (rounding > least).any(axis=1)
 
 
 def _steps(plant: Plant, point: Any) -> FloatArray:

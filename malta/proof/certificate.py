@@ -458,7 +458,7 @@ def _enclose(f: CheckedPolynomial, v: list[tuple[Any, Any]], box: Box, lower: fl
     places = [f.at([arb(x) for x in place]) for place in (middle, *corners)]
     # of each coefficient the largest: one that cancels in the middle asks for no more digits than its neighbours
     size = [max(map(height, each)) for each in zip(*places, strict=True)]
-    axes = [_axis(f, v, i, size) for i in range(len(v))]
+    axes = [_axis(f, v, i, size, box.names[i]) for i in range(len(v))]
     values, left = interpolate(f, v, axes)
     heights = np.array([height(x) for x in values]).reshape(f.count, *(axis.degree + 1 for axis in axes))
     matters = heights > heights.reshape(f.count, -1).max(axis=1).reshape(-1, *[1] * len(axes)) + TAIL
@@ -473,7 +473,7 @@ def _enclose(f: CheckedPolynomial, v: list[tuple[Any, Any]], box: Box, lower: fl
 
 
 def _axis(
-    f: CheckedPolynomial, v: list[tuple[Any, Any]], i: int, size: list[float]
+    f: CheckedPolynomial, v: list[tuple[Any, Any]], i: int, size: list[float], name: str
 ) -> checked_file.AxisEnclosure:
     """The ellipse along v_i that takes the lowest degree. Raises Refused."""
     if i not in f.used or v[i][0] == v[i][1]:
@@ -490,7 +490,7 @@ def _axis(
         rank = (max(start - degree * rate - TAIL, 0.0), degree, rho)
         best = rank if best is None else min(best, rank)
     if best is None or best[0] > 16:
-        raise Refused(f"parameter {i + 1} varies too much for one interpolation")
+        raise Refused(f"{name} varies too much for one interpolation")
     return checked_file.AxisEnclosure(best[1], exact(best[2]), best[1])
 
 

@@ -140,6 +140,33 @@ def groups(loop: UncertainLoop) -> list[StateGroup]:
     return found
 
 
+def sensor_groups(loop: UncertainLoop) -> list[tuple[int, ...]]:
+    """The sensors in groups without any coupling by the loop, in either direction.
+
+    The loop's transfer from an error of the readings to the readings is block diagonal in them, at all parameters. Its
+    largest singular value is that of the worst block, so that a full block of dynamics around all sensors does what it
+    does around the worst group alone.
+    """
+    law, n, p = loop.law, loop.states, loop.program.shapes[C][0]
+    if loop.direct:
+        return [tuple(range(p))]
+    s, k = loop.symbolic, len(law.A)
+    touch = _coupling_pattern(loop) if s is None else _nonzero_couplings(loop, s)
+    if loop.descriptor:
+        for i, j, _ in loop.program.entries[E]:
+            touch[i, j] = True
+    whole = np.zeros((n + k + p,) * 2, dtype=bool)
+    whole[: n + k, : n + k] = touch
+    for i, j, _ in loop.program.entries[C]:
+        whole[n + k + i, j] = True
+    whole[n : n + k, n + k :] = law.B != 0
+    for i, a, _ in loop.program.entries[B]:
+        whole[i, n + k :] |= law.D[a] != 0
+    _, label = sparse.csgraph.connected_components(whole, directed=False)
+    own = label[n + k :]
+    return [tuple(np.flatnonzero(own == one).tolist()) for one in dict.fromkeys(own.tolist())]
+
+
 def _coupling_pattern(loop: UncertainLoop) -> Any:
     """The couplings by the patterns of the matrices alone; terms that cancel count as couplings."""
     law, (n, m), p = loop.law, loop.program.shapes[B], loop.program.shapes[C][0]

@@ -180,11 +180,17 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
     low, high = (float(grid[k - 1]) if k else 0.0), float(grid[k])
     if is_past():
         return high
-    return _narrow_loss(lambda t: float(rates(np.array([t]))[0]), low, high, LOSS_ACCURACY * (high - low))
+    return narrow_loss(lambda t: float(rates(np.array([t]))[0]), low, high, LOSS_ACCURACY * (high - low))
 
 
-def _narrow_loss(rate: Callable[[float], float], low: float, high: float, width: float) -> float:
+WITNESS_DISTANCE = 1e-9  # of a loss of stability: how far beyond the boundary its witness is
+
+
+def narrow_loss(rate: Callable[[float], float], low: float, high: float, width: float) -> float:
     """The least t that was seen with rate(t) >= 0, between a stable `low` and an unstable `high`; Brent's method.
+
+    A share of WITNESS_DISTANCE further where it is unstable there too: at the boundary itself, rounding decides on
+    another computer.
 
     width : to which it is narrowed down
     """
@@ -200,7 +206,8 @@ def _narrow_loss(rate: Callable[[float], float], low: float, high: float, width:
 
     with suppress(ValueError):  # it is unstable at the lower end, too
         optimize.brentq(looked, low, high, xtol=width, maxiter=60, disp=False)
-    return seen
+    further = seen * (1 + WITNESS_DISTANCE)
+    return further if further < high and rate(further) >= 0 else seen
 
 
 # A quick upper bound of a robust margin: eigenvalues of the loop along rays from the nominal parameters.
@@ -333,7 +340,7 @@ def _leave(
         return math.inf
     else:
         low, high = 0.0, end
-    return _narrow_loss(
+    return narrow_loss(
         lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RAY_RESOLUTION * end
     )
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
-from malta.work import MORE_WORK
+from malta.work import MORE_WORK, NO_TIME
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -135,3 +135,6 @@ def unproven(reason: str) -> str:
 
 
 NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")
+NOT_WRITTEN_TEXT = f"the clock ended the search before the model was written out, more time {MORE_WORK}"
+NOT_WRITTEN = replace(NOT_PROVEN, reason=NOT_WRITTEN_TEXT)
+NOT_BEGUN = replace(NOT_PROVEN, reason=f"{NO_TIME}, more {MORE_WORK}")

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from flint import acb, arb, arb_mat, fmpq
 
+from malta.linear.balls import BALLS, POINTS
 from malta.linear.closed_loops import (
     closed_loop as closed_matrices,
     critical_frequency,
     instability,
     worst_frequency,
 )
-from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, exact
+from malta.linear.expressions import EXACT_ARITHMETIC, MatrixProgram, NotAnalytic, exact
 from malta.linear.rational import Symbolic, TooLarge, over_common_denominator, symbolic
 from malta.linear.uncertain import Compensator, StateGroup, UncertainSystem
 from malta.proof.groups import UncertainLoop, groups
@@ -151,6 +152,7 @@ ROW = 6e-4  # work of a row in balls
 EXACT_STEP = 1e-6  # work of an operation in exact numbers
 STEP, STATES_WORK = 4e-6, 1e-6  # work of an operation of the model in balls, and times the cube of the states
 MAX_QUICK_OPERATIONS = 300  # operations of matrices whose exact expressions take no time
+MAX_SEEN = 64  # arrays of rows whose worst poles are remembered
 MAX_WHOLE_ROWS = 2  # of parameters: the poles of the whole loop take less time than those of its groups
 
 
@@ -211,6 +213,7 @@ class OfLoop:
 
     loop: UncertainLoop
     known: dict[Any, Characteristic] = field(default_factory=dict)
+    seen: dict[bytes, FloatArray] = field(default_factory=dict)  # worst poles: several margins begin alike
 
     @property
     def traits(self) -> Traits:
@@ -267,6 +270,14 @@ class OfLoop:
         return np.linalg.eigvals(found) if np.isfinite(found).all() else np.zeros(0)
 
     def instability(self, rows: FloatArray) -> FloatArray:
+        key = rows.tobytes()
+        if key not in self.seen:
+            if len(self.seen) >= MAX_SEEN:
+                self.seen.clear()
+            self.seen[key] = self._instability(rows)
+        return self.seen[key]
+
+    def _instability(self, rows: FloatArray) -> FloatArray:
         if self._plain:
             with suppress(np.linalg.LinAlgError):  # numbers that overflow at some row: each by itself
                 several = len(np.atleast_2d(rows)) > MAX_WHOLE_ROWS and len(self._groups) > 1

@@ -27,6 +27,7 @@ from scipy import linalg
 from malta.arguments import by_name, describe, is_pair, positive
 from malta.budget import GROWTH, WORK, Budget, in_rounds
 from malta.errors import InputError
+from malta.interrupts import watch_interrupts
 from malta.linear.branches import branch_cases
 from malta.linear.compensators import compensator_of
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
@@ -37,11 +38,11 @@ from malta.proof.box import NO_ONE_REST, Box, box_of, within_branches
 from malta.proof.branch_cases import margin_by_cases
 from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
-from malta.proof.margin import IDLE_TEXT, NOT_PROVEN, Margin, Progress, Ranges
+from malta.proof.margin import IDLE_TEXT, NOT_BEGUN, NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.problem import OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.question import Question, Standing
 from malta.proof.search import search
-from malta.work import MORE_WORK, is_past
+from malta.work import MORE_WORK, answer_in_time, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #
@@ -237,13 +238,14 @@ UNSTABLE_TEXT = "the nominal loop is unstable"
 PLACES = 64  # nominal places of a box whose poles are computed at once
 
 
-@on_one_thread
 class ParametricLoop(Protocol):
     """What gives itself as a system and a law in parameters by name, as the loop of a machine does."""
 
     def uncertain(self, names: Sequence[str]) -> tuple[UncertainSystem, Compensator]: ...
 
 
+@on_one_thread
+@answer_in_time(NOT_BEGUN)
 def robust_margin(
     system: UncertainSystem | ParametricLoop,
     compensator: Compensator | Any = None,
@@ -308,7 +310,15 @@ def robust_margin(
                 found, upper=lost.upper, frequency=lost.frequency, witness=lost.witness, searched="",
                 reason=found.reason or NO_ONE_REST,
             )  # fmt: skip
+    if found.reason == UNSTABLE_TEXT and _is_of_the_other_sign(named, law):
+        found = replace(found, reason=f"{UNSTABLE_TEXT}, and stable with -F: u = F y is positive feedback")
     return replace(found, reason=named.reason(found.reason))
+
+
+def _is_of_the_other_sign(system: UncertainSystem, law: Compensator) -> bool:
+    """Whether -F makes the nominal loop stable, as with the K of control.lqr, which is of u = -K x."""
+    turned = replace(law, C=-law.C, D=-law.D)
+    return bool(problem_of(system, turned).instability(system.nominal[None])[0] < 0)
 
 
 def _either_form(
@@ -329,6 +339,7 @@ def _either_form(
 
 
 @on_one_thread
+@answer_in_time(NOT_BEGUN)
 def common_margin(
     places: Sequence[tuple[UncertainSystem, Compensator | Any]],
     ranges: Ranges,
@@ -370,6 +381,7 @@ def _pairs(places: Any) -> list[tuple[UncertainSystem, Any]]:
 
 
 @on_one_thread
+@answer_in_time(NOT_BEGUN)
 def margin_at(
     system: UncertainSystem,
     compensator: Compensator,
@@ -482,7 +494,8 @@ def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
         return math.inf if found.reason == problem.traits.approximate else rank_of(found)
 
     try:
-        found, ended = in_rounds(effort.limits, ask, rank)
+        with watch_interrupts():
+            found, ended = in_rounds(effort.limits, ask, rank)
     except KeyboardInterrupt as stop:
         raise Interrupted(_interrupted_margin(problem, box, standing, clock.monotonic() - begun)) from stop
     found = _name_idle(found, problem, box)

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from malta.proof.polynomial.enclosure import Polynomial
     from malta.proof.question import Searches
 
-FIRST_BOX = 3.97  # the first box that is searched, in multiples of the modelled one
+FIRST_BOX = 3.97  # the first box, in multiples of the modelled one, where no corner says another
+NEAR_BOX = 6.0  # the largest that a corner may say
 MIN_WIDER_WORK, MIN_WIDER_SHARE = 0.5, 0.015  # work, and share of it, that a wider box may take at least
 COUPLED_BOX = 1.005  # box of couplings, in multiples of where axes by themselves are lost
 LOOK = 0.2  # share of the work for a first look at the poles of corners
@@ -138,16 +139,17 @@ def _part_over(f: Polynomial, moves: tuple[Any, ...], box: Box, sides: FloatArra
 
 
 def _first_reach(q: Question) -> float:
-    """The size of the first box: a little beyond the loss by the poles of its corners.
+    """The size of the first box: a little beyond the loss by the poles of its corners, where that is near.
 
-    Of several parameters at most FIRST_BOX: families of a larger box are dear, and the nearest loss may be no corner.
+    Of several parameters else FIRST_BOX: families of a larger box are dear, and the nearest loss may be no corner.
     """
     one = np.count_nonzero(q.box.down) + np.count_nonzero(q.box.up) == 1
     most = q.box.limit if one else min(q.box.limit, FIRST_BOX)
+    near = most if one else min(q.box.limit, NEAR_BOX)
     now = work_done()
     with work_limit(now + LOOK * (q.end - now)):
-        t = corner_loss(q.problem, q.box, most)
-    return most if t is None else min(most, 1.02 * t)
+        t = corner_loss(q.problem, q.box, near)
+    return most if t is None or t > near else min(near, 1.02 * t)
 
 
 def _descend(known: Findings, part: BoxPart, until: float) -> Findings:

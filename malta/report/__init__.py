@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
         new_figure as new_figure,
         save as save,
     )
+    from malta.report.figures.loads import load_limits_figure as load_limits_figure
     from malta.report.figures.margins import (
         chain_figure as chain_figure,
         front_figure as front_figure,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
         gain_page as gain_page,
     )
     from malta.report.plots import (
+        block_diagram as block_diagram,
         bode as bode,
         gang_of_four as gang_of_four,
         load_response as load_response,
@@ -47,6 +49,7 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
         root_locus as root_locus,
         sensitivity_curves as sensitivity_curves,
         sigma as sigma,
+        statechart as statechart,
         step as step,
     )
     from malta.report.plots.polar import margin_map as margin_map
@@ -74,6 +77,7 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
         limits_text as limits_text,
         scenarios_table as scenarios_table,
     )
+    from malta.report.tables.loads import load_limits_table as load_limits_table
     from malta.report.tables.margins import (
         chain_table as chain_table,
         disk_table as disk_table,
@@ -112,16 +116,18 @@ _NAMES = {
     "malta.report.figures.campaign": "CAMPAIGN_FILES CampaignFigures campaign distributions_figure"
     " sensitivity_figure worst_figure yield_figure",
     "malta.report.figures.drawing": "STYLES encode_figure new_figure save",
+    "malta.report.figures.loads": "load_limits_figure",
     "malta.report.figures.margins": "chain_figure front_figure recovery_figure",
     "malta.report.page.report": "compare_gains comparison_page gain_page",
-    "malta.report.plots": "bode gang_of_four load_response nichols nyquist pzmap root_locus"
-    " sensitivity_curves sigma step",
+    "malta.report.plots": "block_diagram bode gang_of_four load_response nichols nyquist pzmap root_locus"
+    " sensitivity_curves sigma statechart step",
     "malta.report.plots.polar": "margin_map",
     "malta.report.tables": "Paragraph",
     "malta.report.tables.campaign": "campaign_tables rare_event_tables sensitivity_tables spreads_table",
     "malta.report.tables.design": "bandwidth_table design_page front_markdown front_table loop_poles_table"
     " poles_table recovery_table requirements_table sensitivity_table",
     "malta.report.tables.experiments": "claims_table experiment_table limits_text scenarios_table",
+    "malta.report.tables.loads": "load_limits_table",
     "malta.report.tables.margins": "chain_table disk_table gang_table loop_tables open_bounds places_table"
     " tolerance_table worst_case_table",
     "malta.report.verdict": "verdict_html verdict_lines verdict_text",

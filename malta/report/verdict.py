@@ -19,7 +19,8 @@ from rich.text import Text
 
 from malta.bound import at_least, at_most
 from malta.display import micro, number
-from malta.margins.loop_report import LoopReport, Outcome, zone
+from malta.margins.loop_report import LoopReport, zone
+from malta.margins.outcome import Outcome, near_limits
 from malta.model.parameters import box_words
 from malta.report.tables import fold
 
@@ -135,15 +136,15 @@ def _requirements(outcomes: Sequence[Outcome]) -> VerdictLine:
         return VerdictLine("requirements", "not judged", "no [specification] to judge by")
     failed = sorted((one for one in asked if one.verdict == "fails"), key=lambda one: -one.ratio)
     undecided = [one for one in asked if one.verdict == "undecided"]
-    held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
     notes = [f"{one.words} {one.found_text}, asked {one.asked_text}" for one in (*failed, *undecided)][
         :SHOWN_FAILURES
     ]
     more = len(failed) + len(undecided) - len(notes)
     notes += [f"{more} more"] if more else []
     if not failed and not undecided:
-        near = ", ".join(f"{one.words} {one.nearness}" for one in held[:SHOWN_NEAR_LIMITS])
-        return VerdictLine("requirements", f"all {len(asked)} hold", f"nearest their limits: {near}", "good")
+        near = near_limits(asked, SHOWN_NEAR_LIMITS)
+        note = near and f"nearest their limits: {near}"
+        return VerdictLine("requirements", f"all {len(asked)} hold", note, "good")
     parts = [f"{len(failed)} of {len(asked)} {'FAILS' if len(failed) == 1 else 'FAIL'}"] if failed else []
     parts += [f"{len(undecided)} undecided"] if undecided else []
     return VerdictLine("requirements", ", ".join(parts), "; ".join(notes), "bad" if failed else "near")

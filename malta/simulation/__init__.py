@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from malta.simulation.flown_strokes import stroke_figures as stroke_figures
     from malta.simulation.multisine import Multisine as Multisine
     from malta.simulation.scenario import Fault as Fault
+    from malta.simulation.steps import choose_steps as choose_steps
     from malta.simulation.trajectory import Trajectory as Trajectory
 
 _NAMES = {
@@ -29,6 +30,7 @@ _NAMES = {
     "malta.simulation.flown_strokes": "stroke_figures",
     "malta.simulation.multisine": "Multisine",
     "malta.simulation.scenario": "Fault",
+    "malta.simulation.steps": "choose_steps",
     "malta.simulation.trajectory": "Trajectory",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"replayed": "malta.simulation.replay_run"})

@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.special import erf
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
@@ -150,7 +149,10 @@ def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     taken = [share * _earlier(v_ff, age)[:-1] for age, share in lag_shares(c)]
     given = np.vstack([v_ff[:1], sum(taken[1:], taken[0])])
     # One by one, as in the exported C: a solver of LAPACK rounds as the kernels of BLAS do.
-    columns = (accumulate(column, lambda last, now: now + decay * last) for column in given.T.tolist())
+    columns = (
+        accumulate(column, lambda last, now: now + decay * last) if any(column) else column  # most are zero
+        for column in given.T.tolist()
+    )
     return np.array([list(column) for column in columns]).T
 
 
@@ -248,6 +250,8 @@ def sensor_noise(run: Simulation, stages: list[tuple[int, Plant]], t: FloatArray
     if scenario.noise:
         drawn = normals_of_parts(keys(scenario.seed, np.atleast_1d(scenario.run)), *drawn.shape)
         if plant.sensors.uniform:
+            from scipy.special import erf  # here: it takes long to load
+
             drawn = math.sqrt(3) * erf(drawn / math.sqrt(2))
         for k, (first, now) in enumerate(stages):
             last = stages[k + 1][0] if k + 1 < len(stages) else len(t)

@@ -215,13 +215,20 @@ class Period(NamedTuple):
 
 
 def period_of(
-    plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *, constant: bool
+    plant: Plant,
+    c: Controller,
+    s: Setup,
+    values: Mapping[str, ca.DM],
+    *,
+    constant: bool,
+    shorten: Callable[[Any], Any] = ca.cse,
 ) -> Period:
     """The functions of one control period.
 
     values : every number of machine, controller and sensors, see numbers_of
     constant : True puts the numbers into the functions, which is faster on CasADi's virtual machine. False makes them
         the argument theta, so that one set of functions serves every machine and controller of the same shape.
+    shorten : of their expressions; the same functions in more operations are had sooner without it
     """
     g: dict[str, Any] = {name: ca.SX(value) for name, value in values.items()}
     theta: Any = ca.SX(0, 1)
@@ -247,11 +254,11 @@ def period_of(
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first) if plant.has_stroke else first
     if s.current_sensors:
         measured = ca.vertcat(measured, reading_errors(loop, machine, noise[outputs:]))
-    sense = ca.Function("sense", [state, around, noise, theta], ca.cse([ca.densify(measured), at]))
+    sense = ca.Function("sense", [state, around, noise, theta], shorten([ca.densify(measured), at]))
 
-    moved = ca.cse(ca.densify(advance(loop, signals, held, jitter)))
+    moved = shorten(ca.densify(advance(loop, signals, held, jitter)))
     substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, jitter, theta], [moved])
-    return Period(sense, _decide_function(loop, theta, sizes), substep, names)
+    return Period(sense, _decide_function(loop, theta, sizes, shorten), substep, names)
 
 
 def columns_of(c: Controller) -> tuple[int, ...]:
@@ -326,7 +333,7 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
     return ca.densify(ca.vertcat(*(values.get(name, ca.SX.zeros(size)) for name, size in state.items())))
 
 
-def _decide_function(loop: LoopPlan, theta: Any, sizes: Layout) -> ca.Function:
+def _decide_function(loop: LoopPlan, theta: Any, sizes: Layout, shorten: Callable[[Any], Any]) -> ca.Function:
     """The function `decide` of Period: in CasADi's SX; in MX where the controller looks something up in a table."""
     plant = loop.plant
     kind = ca.MX if plant_of(loop.controller.parameters).actuator.tabulated else ca.SX
@@ -351,7 +358,7 @@ def _decide_function(loop: LoopPlan, theta: Any, sizes: Layout) -> ca.Function:
     state = ca.vertcat(*machine.values(), *controller.values())
     arguments = [state, ca.vertcat(*given.values()), read, v0, theta]
     if kind is ca.SX:
-        return ca.Function("decide", arguments, ca.cse(decided))
+        return ca.Function("decide", arguments, shorten(decided))
     # The arguments of an MX function are symbols, so the signals are cut out of whole vectors.
     whole = [ca.MX.sym("state", *arguments[0].shape), ca.MX.sym("given", *arguments[1].shape)]
     pieces = []

@@ -18,7 +18,7 @@ from malta.model.parameters import replace_fields, units_of
 from malta.model.plant import Plant
 from malta.model.sensors import require_short, split_dead_time
 from malta.simulation import references
-from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
+from malta.simulation.layout import FIDELITIES, Fidelity, Setup, fidelities
 from malta.simulation.references import Profile, Reference
 from malta.synthesis.controller import Controller
 
@@ -89,7 +89,8 @@ class Scenario:
     seed : of the noise
     run : index in a campaign: the noise depends on seed and run only. Several: equal parts of the time have theirs.
     delay : samples between measurement and force, also a fraction; None: the machine's own
-    substeps : Runge-Kutta steps in a sample, at least 2 where commands begin in it; None: as many as the machine needs
+    substeps : Runge-Kutta steps in a sample, at least 2 where commands begin in it; None: as many as `accuracy` needs
+    accuracy : wanted integration error, SI, of `malta.simulation.choose_steps`; None: 1e-9 m or rad, or what is reached
     fidelity : how forces arise: "force" (at once), "dq" (current loops in axes) or "phase" (duty cycles of the phases)
     real_pwm : duty cycles with a resolution, dead time (fidelity phase)
     bearing_axes : of the current controllers: "fixed", or "turning" with the mover
@@ -129,6 +130,7 @@ class Scenario:
     run: int | tuple[int, ...] = 0
     delay: float | None = None
     substeps: int | None = None
+    accuracy: float | None = None
     fidelity: Fidelity = "dq"
     real_pwm: bool = False
     bearing_axes: BearingAxes = "fixed"
@@ -168,6 +170,7 @@ class Scenario:
             ("settle", 0, False),
             ("noise", 0, False),
             ("substeps", 1, True),
+            ("accuracy", 1e-300, False),
             ("delay", 0, False),
             ("seed", 0, True),
             ("run", 0, True),
@@ -182,6 +185,8 @@ class Scenario:
                 raise InputError(where, name, str(value), "a number above 0" if low else "0 or more")
         if self.substeps is not None and self.substeps > MOST_SUBSTEPS:
             raise InputError(where, "substeps", str(self.substeps), f"at most {MOST_SUBSTEPS}")
+        if self.substeps is not None and self.accuracy is not None:
+            raise InputError(where, "accuracy", "one beside substeps", "one of the two")
         for name, known in (
             ("fidelity", FIDELITIES),
             ("estimator", ESTIMATORS),
@@ -383,32 +388,3 @@ def machines_of(plant: Plant, s: Scenario) -> list[Plant]:
         par: Any = replace(machines[-1].parameters, **known)
         machines.append(plant.variant(par))
     return machines
-
-
-def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
-    """Substeps of the simulation in a sample: Runge–Kutta steps, or periods of the machine's electronics.
-
-    Raises InputError for more than MOST_SUBSTEPS.
-    """
-    fast = electronics_of(plant, setup)
-    if fast is None:
-        return steps_of(plant, c, s)
-    return _require_few(c.sample_time / fast.period, s, "periods of the electronics in a sample")
-
-
-def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
-    """Runge–Kutta steps in a sample: the scenario's, else one a time constant of the current loops, at least 4.
-
-    Raises InputError for more than MOST_SUBSTEPS.
-    """
-    if s.substeps is not None:
-        return max(2, s.substeps) if split_delay(delay_of(plant, c, s))[1] else s.substeps
-    lag = c.sample_time * plant.actuator.crossover
-    few = _require_few(lag, s, "time constants of the current loops in a sample") if math.isfinite(lag) else 0
-    return max(4, math.ceil(few))
-
-
-def _require_few(count: float, s: Scenario, what: str) -> float:
-    if count > MOST_SUBSTEPS:
-        raise InputError(s.where, "substeps", f"{count:.3g} {what}", f"at most {MOST_SUBSTEPS}")
-    return count

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray, readonly
 from malta.display import Curves, Description, display, quantity
+from malta.frames import data_frame
 from malta.merits import Merit
 from malta.model.plant import Plant
+from malta.model.signals import Signal
 from malta.simulation.divergence import free_outputs, rooms_in, rooms_of
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of
+from malta.simulation.steps import stated_error
 from malta.synthesis.controller import Controller
 from malta.units import FINE_UNITS
 
@@ -118,6 +121,8 @@ class Trajectory:
     scenario : the scenario
     verdict : its name, as "completed", and its time (s)
     engine : which simulated it: "compiled" or "virtual machine"
+    integration_error : bound of what Runge-Kutta steps err in p, as in `malta.simulation.choose_steps`; NaN: not known,
+        with `substeps`, electronics of their own pace, or contacts
     t : k, s; from 0 on, but for a run that ended while it settled
     reference : k x p
     p : k x p, true outputs
@@ -151,6 +156,7 @@ class Trajectory:
     scenario: Scenario
     verdict: Verdict
     engine: str
+    integration_error: float
     t: FloatArray
     reference: FloatArray
     p: FloatArray
@@ -174,6 +180,33 @@ class Trajectory:
             array = getattr(self, name)
             if array is not (sealed := readonly(array)):
                 object.__setattr__(self, name, sealed)
+
+    @property
+    def columns(self) -> dict[str, tuple[Signal, ...]]:
+        """The signals of each series that was simulated: its columns."""
+        plant, coils = self.plant, self.plant.actuator.coils
+        drive = plant.actuator.windings
+        axes, phases = ((), coils) if drive is None else (drive.axes, drive.phases)
+        volts = tuple(Signal(s.name.replace("i_", "u_"), "V") for s in axes)
+        shares = tuple(Signal(s.name.replace("i_", "d_"), "1") for s in phases)
+        every = dict.fromkeys(("reference", "p", "y"), plant.outputs)
+        every |= {"x": plant.states, "xi_hat": self.controller.states}
+        every |= dict.fromkeys(("v", "force", "saturated"), plant.inputs)
+        every |= {"current": coils, "i": axes, "u": volts, "link": (Signal("V_link", "V"),)}
+        every |= {"i_phase": phases, "duty": shares}
+        return {name: signals for name, signals in every.items() if getattr(self, name).shape[1]}
+
+    def to_pandas(self) -> Any:
+        """The series as a pandas.DataFrame by time, a column a signal: "p z [m]". SI.
+
+        Raises InputError where pandas is not installed.
+        """
+        series = {
+            f"{name} {signal.name} [{signal.unit}]": column
+            for name, signals in self.columns.items()
+            for signal, column in zip(signals, getattr(self, name).T, strict=True)
+        }
+        return data_frame(series, ("t [s]", self.t))
 
     @property
     def limits(self) -> tuple[str, ...]:
@@ -242,6 +275,9 @@ class Trajectory:
         if plant.contacts.names:
             rows.append((figures[-1].label, f"{figures[-1].phrase()} of a clearance"))
         rows.append(("limits reached", ", ".join(self.limits) or "none"))
+        units = "/".join(dict.fromkeys(signal.unit for signal in plant.outputs))
+        if not math.isnan(self.integration_error):
+            rows.append(("integration error", f"below {self.integration_error:.2g} {units}"))
         off, size = self.p - self.reference, [one.value for one in figures[::2]]
         shown = {s.name: off[:, k] / (size[k] or 1.0) for k, s in enumerate(plant.outputs)}
         curves = Curves(self.t, "time [s]", shown, "(p - p*) / its largest [1]")
@@ -274,6 +310,8 @@ def label_rows(
     columns = columns_of_row(plant, controller, setup)
     if setup.bearing and (verdict is None or verdict.name in plant.contacts.names):
         verdict = bearing_verdict(plant, rows[:, columns["contact"]], t) or verdict
+    verdict = verdict or Verdict("completed", scenario.duration)
+    steady = verdict.completed and not (setup.bearing and (rows[:, columns["contact"]] >= 1).any())
     before = scenario.settling_samples(controller.sample_time)
     kept = slice(before if done > before else 0, done)
     rows = rows[kept.start :]
@@ -282,8 +320,9 @@ def label_rows(
         plant,
         controller,
         scenario,
-        verdict or Verdict("completed", scenario.duration),
+        verdict,
         kind,
+        stated_error(run) if steady else math.nan,
         t=t[kept],
         reference=given[kept, : len(plant.outputs)],
         **{name: rows[:, columns.get(name, none)] for name in SERIES},

@@ -44,6 +44,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import controller_of
 from malta.synthesis.structure import Structure, places_of, sample_law
+from malta.work import is_stopped
 
 Values = Mapping[str, float]
 
@@ -447,9 +448,9 @@ class _Asked:
 
 
 def _search(task: Task, starts: Sequence[Any]) -> Look:
-    """The best law. Raises CheckError where it breaks hard goals."""
+    """The best law by then. Raises CheckError where it breaks hard goals after a whole search."""
     look = search(task, starts)
-    both = contradiction(look) if look.hard > 1 + ROOM else None
+    both = contradiction(look) if look.hard > 1 + ROOM and not is_stopped() else None
     if both is not None:
         one, other = both
         against = f"{one} against {other}" if one != other else one
@@ -458,12 +459,12 @@ def _search(task: Task, starts: Sequence[Any]) -> Look:
 
 
 def _try_start(asked: _Asked, task: Task) -> tuple[Task, Look, LawProof, int] | None:
-    """The first values, where they hold all hard goals and the proof closes."""
+    """The first values, where they hold all hard goals and the proof closes, or there was no time for it."""
     look = task.look(np.zeros(len(task.structure.parameters)))
     if look is None or look.hard > 1 + ROOM:
         return None
     proof = asked.prove(task.structure.system(look.x))
-    return (task, look, proof, 0) if proof.closed or asked.ranges is None else None
+    return (task, look, proof, 0) if proof.closed or asked.ranges is None or is_stopped() else None
 
 
 def _rounds(
@@ -478,7 +479,7 @@ def _rounds(
         proof = asked.prove(task.structure.system(look.x))
         known = {(model.name, model.goals) for model in task.models}
         new = tuple(m for m in proof.refuting if (m.name, m.goals) not in known)
-        if proof.closed or not new or count == ROUNDS:
+        if proof.closed or not new or count == ROUNDS or is_stopped():
             break
         more = replace(task, models=(*task.models, *new))
         say(f"round {count + 1}: tuning on {len(more.models)} models")

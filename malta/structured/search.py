@@ -29,6 +29,7 @@ from malta.structured.goals import Goal, GoalFigure, stability
 from malta.structured.loops import ClosedLoop, TunedPlant
 from malta.synthesis.elements import CALLER
 from malta.synthesis.structure import Structure
+from malta.work import is_stopped
 
 PENALTY = 30.0  # cost of a hard figure's excess over 1, in that of a soft one
 RADIUS = 0.3  # of the first step, in x
@@ -89,7 +90,7 @@ def minimize(look: Looker, start: Look, bounds: FloatArray, effort: DescentLimit
     here, radius, still = start, RADIUS, 0
     H: FloatArray = FIRST_CURVATURE * np.eye(len(start.x))
     for _ in range(effort.steps):
-        if here.merit <= effort.enough or radius < 1e-7:
+        if here.merit <= effort.enough or radius < 1e-7 or is_stopped():
             break
         found = _program(here, H, bounds, radius)
         if found is None:
@@ -283,7 +284,7 @@ def search(task: Task, starts: Sequence[FloatArray]) -> Look:
     """The best law of several starts.
 
     Raises InputError for a structure that stabilizes the models from none of them, with a pole that no law of it moves
-    where there is one.
+    where there is one; CheckError where the clock ended the search before.
     """
     bounds, best, slowest = task.structure.bounds, None, math.inf
     wanted = any(not goal.hard for goal in task.goals)
@@ -301,6 +302,8 @@ def search(task: Task, starts: Sequence[FloatArray]) -> Look:
             best = found
         if not wanted and best.hard <= 1:
             break
+    if best is None and is_stopped():
+        raise CheckError(f"{CALLER}: the time was up before a stable law was found")
     if best is None:
         raise InputError(CALLER, "law", _unstable(task, slowest), "a structure that stabilizes every model")
     return best

@@ -47,10 +47,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 
+from malta.arguments import describe as describe_value
 from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
@@ -89,6 +90,11 @@ class Feedforward:
     def at(self, z: float) -> FloatArray:
         """v0(z), N, m forces."""
         return np.array([np.interp(z, self.z_grid, column) for column in self.v0.T])
+
+    def at_rest(self, z: float, q: FloatArray) -> FloatArray:
+        """What is fed forward, N, of a machine at rest at its reference, with positions q: m forces."""
+        moved = self.position @ q[: self.position.shape[1]] if self.position.size else 0.0
+        return np.asarray(self.at(z) + moved)
 
     def slope(self, z: float) -> FloatArray:
         """dv0/dz, N/m, m forces, across the grid interval about z, at its ends the last one; zero beyond the grid."""
@@ -309,11 +315,17 @@ class Controller:
         return law_system(self)
 
     @cached_property
-    def compensator(self) -> Any:
-        """The law without saturation as a malta.proof.Compensator, behind its machine's delay and current loops."""
-        from malta.synthesis.law_system import law_compensator
+    def compensator_fields(self) -> dict[str, Any]:
+        """The law without saturation, with its machine's delay and current loops: fields of a Compensator of proofs."""
+        from malta.synthesis.law_system import compensator_fields
 
-        return law_compensator(self)
+        return compensator_fields(self)
+
+    @property
+    def compensator(self) -> NoReturn:
+        """Moved: `malta.proof.Compensator(**controller.compensator_fields)`. Raises InputError, which says so."""
+        moved = "malta.proof.Compensator(**controller.compensator_fields)"
+        raise InputError(self.name, "compensator", "a name that has moved", moved)
 
 
 def lag_shares(c: Controller) -> list[tuple[int, float]]:
@@ -361,3 +373,10 @@ def holding_gain(A: FloatArray, B: FloatArray) -> FloatArray:
     """Forces that hold q'' = k q + G v at rest at a position: -G^-1 k, m x n / 2, N/m."""
     half = len(A) // 2
     return np.asarray(-np.linalg.lstsq(B[half:], A[half:, :half], rcond=None)[0])
+
+
+def given_law(caller: str, law: Any) -> Controller:
+    """A law that is a Controller. Raises InputError for anything else, as the name of a gain file."""
+    if not isinstance(law, Controller):
+        raise InputError(caller, "controller", describe_value(law), "a Controller, as malta.gains.read gives")
+    return law

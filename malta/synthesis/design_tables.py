@@ -292,7 +292,7 @@ def _kind(requirement: Requirement) -> Any:
         return StrictBool
     if requirement.form == "loads":
         return dict[StrictStr, RecoveryTable]
-    if requirement.form in ("outputs", "inputs"):
+    if requirement.form in ("outputs", "inputs", "disturbances"):
         return dict[StrictStr, Quantity]
     if requirement.unit == "1":
         return Annotated[Finite, Field(gt=requirement.above)]

@@ -11,7 +11,6 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import balanced_units
-from malta.linear.uncertain import Compensator
 from malta.model.machines import build_plant
 from malta.model.places import outputs_at
 from malta.synthesis.controller import Controller
@@ -40,8 +39,8 @@ def law_system(c: Controller) -> Any:
     return control.ss(*matrices, c.sample_time, name=c.name, inputs=inputs, outputs=forces, **names)
 
 
-def law_compensator(c: Controller) -> Compensator:
-    """The control law as the compensator of a proof: hold, the actuator's delay, and its lag.
+def compensator_fields(c: Controller) -> dict[str, Any]:
+    """The fields of the compensator that a proof has for the law: with hold, the actuator's delay, and its lag.
 
     Raises InputError for a law that is scheduled.
     """
@@ -53,7 +52,8 @@ def law_compensator(c: Controller) -> Compensator:
     lag = float(actuator.crossover) if math.isfinite(actuator.crossover) else None
     sums = 0 if c.observed else len(c.summed)
     Ts = c.sample_time
-    return Compensator(law.A, law.B_y, law.C, law.D_y, sums, Ts, actuator.delay(Ts), lag)
+    held = {"sample_time": Ts, "delay": actuator.delay(Ts), "lag": lag}
+    return {"A": law.A, "B": law.B_y, "C": law.C, "D": law.D_y, "integrals": sums, **held}
 
 
 def reference_names(c: Controller) -> list[str]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from malta.synthesis.step_response import StepResponse
 
 Trade = Literal["force", "motion"]
-Form = Literal["number", "switch", "outputs", "inputs", "loads"]
+Form = Literal["number", "switch", "outputs", "inputs", "disturbances", "loads"]
 Verdict = Literal["holds", "fails", "undecided"]
 Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
 SEEDS = (4, 8, 16, 32)  # numbers of seeds after which a simulated figure is compared with its bound
@@ -89,6 +89,9 @@ class Design(Protocol):
     def deviation(self, bound: RecoveryBound) -> Figure:
         """Under a constant load from outside, of the machine's linear loop: what the bound is of."""
 
+    def largest_load(self, disturbance: str) -> Figure:
+        """The largest load that touches no contact, whatever its waveform: of the machine's linear loop."""
+
     def fly(self, name: str, **options: Any) -> Any:
         """Run an experiment of the machine by name: simulation.experiments.Experiment."""
 
@@ -114,6 +117,8 @@ class TrialFigures:
     # of w (rad/s), p and x: the true outputs, p complex amplitudes, while the reference is p exp(jwt) and the states
     # that go with it are x exp(jwt)
     follow: Callable[[float, FloatArray, ComplexArray], ComplexArray]
+    # of any waveform of a disturbance: the size that touches no contact which these states move; None: none is moved
+    largest_load: Callable[[str], float | None]
 
 
 Measure = Callable[[Design, float, str], Sequence[Figure]]  # of a bound that is asked for, of a signal or ""
@@ -130,7 +135,7 @@ class Requirement:
     unit : SI; of a requirement by signal each signal's own
     at_least : bounds from below; otherwise from above
     laws : the kinds of controllers that can be asked for it
-    form : what the file holds: a number with its unit, true, a table of outputs or inputs, or of loads (recovery.py)
+    form : what the file holds: a number with its unit, true, a table of signals, or of loads (recovery.py)
     above : numbers without a unit must be larger
     estimate : (loop, signal) -> figure of a trial; None: the search does not look at it
     needs_stability : an unstable loop has no such figure, and fails
@@ -139,6 +144,7 @@ class Requirement:
     heading : its words in the Pareto front, without "motion"; none: not shown, or by the signal's name
     meaning : what is bounded, in words, for schemas and pages
     indices : of the inputs (force) or outputs (motion) whose noise at rest it bounds; None: it bounds no such noise
+    error_of : outputs whose errors in the main job it is about, beside whose curves its bound is drawn
     """
 
     name: str
@@ -155,6 +161,7 @@ class Requirement:
     heading: str = ""
     meaning: str = ""
     indices: Indices | None = None
+    error_of: tuple[str, ...] = ()
 
     def suits(self, law: Law) -> bool:
         """Whether a kind of law can be asked for it: one of a given structure for what all others can be."""
@@ -162,7 +169,7 @@ class Requirement:
 
     def signals(self, plant: Plant) -> tuple[Signal, ...]:
         """Return the signals that can be bounded one by one; none for one bound of the whole machine."""
-        tables = {"outputs": tuple(plant.outputs), "inputs": tuple(plant.inputs)}
+        tables = {name: tuple(getattr(plant, name)) for name in ("outputs", "inputs", "disturbances")}
         return tables.get(self.form, ())
 
     def unit_of(self, spec: Spec, signal: str) -> str:
@@ -298,6 +305,15 @@ GENERIC_REQUIREMENTS = (
         form="loads",
         estimate=_recovery_estimate,
         meaning="what a constant load from outside does, by the name of a load",
+    ),
+    Requirement(
+        "never_touches",
+        lambda design, _asked, signal: [design.largest_load(signal)],
+        at_least=True,
+        laws=("LQG", "PID"),
+        form="disturbances",
+        estimate=lambda trial, signal: trial.largest_load(signal),
+        meaning="load of any waveform that no contact is touched by, of the linear loop, at least",
     ),
     noise_at_rest(
         "motion",

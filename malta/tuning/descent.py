@@ -21,6 +21,7 @@ import numpy as np
 from scipy import optimize
 
 from malta.arrays import FloatArray
+from malta.work import is_stopped
 
 DIFFERENCES = (0.02, 0.06, 0.007)  # steps of u, the next where one leads no further
 TRIES = 5  # smaller radii with one linearization
@@ -52,6 +53,8 @@ class BoundPenalty(NamedTuple):
 def descend(look: Look, u: FloatArray, merit: BoundPenalty, trials: int) -> FloatArray:
     """Go down from a place until a number of trials or until no step leads further; an unstable place stays.
 
+    Where the clock ends the search, the last step is where it ends.
+
     >>> import numpy as np
     >>> roof = lambda u: (0.0, np.array([u[0] - u[1], u[1] - 0.5, 0.3 - u[0]]))
     >>> bool(
@@ -63,11 +66,11 @@ def descend(look: Look, u: FloatArray, merit: BoundPenalty, trials: int) -> Floa
     ... )
     True
     """
-    start = look(u) if len(u) and trials > 0 else None
+    start = look(u) if len(u) and trials > 0 and not is_stopped() else None
     if start is None:
         return u
     here, radius, stuck, used = Point(u, *start), FIRST_RADIUS, 0, 1
-    while used < trials and stuck < len(DIFFERENCES):
+    while used < trials and stuck < len(DIFFERENCES) and not is_stopped():
         slopes = _slopes(look, here, DIFFERENCES[stuck])
         there, radius, tries = _advance(look, here, slopes, merit, radius)
         used += len(u) + tries

@@ -15,7 +15,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -25,14 +26,17 @@ from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import covariance
 from malta.linear.peaks import largest_gain
 from malta.linear.sampling import add_lags, sample
-from malta.loops.bandwidths import last_crossover, tracked_band
+from malta.loops.bandwidths import in_sizes, last_crossover, reading_sizes, tracked_band
 from malta.loops.classical import Nominal
-from malta.loops.noise import covariance, noise_variance
+from malta.loops.clearances import Clearance
+from malta.loops.noise import noise_variance
 from malta.loops.parametric_plants import of_plant
-from malta.loops.sampled_loops import SampledLoop, disturbance_map, push_through
+from malta.loops.sampled_loops import SampledLoop, disturbance_map, pad, push_through, stored_readings
 from malta.loops.windings import (
+    Caught,
     WindingModel,
     emf_slope,
     estimated_rows,
@@ -45,6 +49,7 @@ from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
 from malta.model.places import position_in
 from malta.model.plant import Plant
+from malta.model.sensors import split_dead_time, with_lags
 from malta.synthesis.controller import CurrentLoop, holding_gain
 from malta.synthesis.feedforward import current_loop_of, static_feedforward
 from malta.synthesis.filters import Gains, gain_at_rest
@@ -54,6 +59,7 @@ from malta.synthesis.requirements import NoiseRms, Requirement, TrialFigures, re
 from malta.synthesis.spec import Spec
 from malta.synthesis.step_response import StepResponse, step_response
 from malta.synthesis.weighting import Weights
+from malta.tuning.touches import asked_loads, largest_trial_load, touched_contacts
 
 # The sampled machine at the corners of its box of parameters, and where each corner of the growing box is lost.
 
@@ -65,11 +71,13 @@ CORNER_FACTOR = 1.3  # times the smallest margin, beyond which no corner is look
 
 @dataclass(frozen=True, eq=False)
 class SampledMachine:
-    """Sampled machines with hold, delay and current loops; leading axes are corners of the box."""
+    """Sampled machines with hold, delay, current loops and late sensors; leading axes are corners of the box."""
 
     Ad: FloatArray
     Bd: FloatArray
-    Cd: FloatArray
+    Cd: FloatArray  # of the readings
+    true: FloatArray  # of the outputs
+    caught: tuple[int, Caught] | None = None  # readings within a sample, and the first of their states
 
     def close(self, F: LinearLaw) -> FloatArray:
         """Close the loops with a law, without its references."""
@@ -117,19 +125,22 @@ def _is_lost(table: SampledMachine, F: LinearLaw, which: Indices, t: float | Flo
     t = np.broadcast_to(np.asarray(t), which.shape)
     k = np.minimum((t / STEP).astype(int), len(table.Ad) - 2)
     share = (t / STEP - k)[:, None, None]
-    between = SampledMachine(
-        *((1 - share) * M[k, which] + share * M[k + 1, which] for M in (table.Ad, table.Bd, table.Cd))
-    )
+    tables = table.Ad, table.Bd, table.Cd, table.true
+    between = SampledMachine(*((1 - share) * M[k, which] + share * M[k + 1, which] for M in tables))
     lost: NDArray[np.bool_] = np.abs(np.linalg.eigvals(between.close(F))).max(axis=1) >= 1
     return lost
 
 
 class MachinePart(NamedTuple):
-    """Continuous states of a machine that close loops by themselves: x' = A x + B v, p = C x."""
+    """Continuous states of a machine that close loops by themselves: x' = A x + B v, p = C x.
+
+    read : of the readings, where sensors lag, behind states that A has then
+    """
 
     A: FloatArray
     B: FloatArray
     C: FloatArray
+    read: FloatArray = np.zeros((0, 0))
 
     @property
     def E(self) -> FloatArray:
@@ -170,6 +181,7 @@ class TuningGroup:
     places: tuple[StrokePlace, ...]  # where loads act from outside: operating point and ends; or none
     role: tuple[Any, ...]  # what the requirements see in it: stroke, thrust, bounds of its signals
     requirements: tuple[tuple[str, str, Requirement], ...]  # figure, signal, requirement, with an estimate
+    contacts: tuple[Clearance, ...]  # that its states move, where loads are asked for that touch nothing
 
     @property
     def picture(self) -> tuple[Any, ...]:
@@ -246,6 +258,7 @@ def groups_of(spec: Spec) -> list[TuningGroup]:
                 places,
                 (*_role(spec, j, o), *_pushes(spec, o, places)),
                 _estimates(spec),
+                touched_contacts(spec, loaded.operating_point.x, i.tolist()),
             )
         )
     return found
@@ -300,14 +313,19 @@ def _slope(plant: Plant, position: float) -> FloatArray:
 
 
 def _loaded_places(spec: Spec) -> list[tuple[LinearModel, FloatArray]]:
-    """The machine at its trims where bounds of [specification.recovery] are estimated, each with the slope of v0."""
+    """The machine at its trims where it is asked what loads do, each with the slope of v0."""
     plant = spec.plant
-    along: list[Mapping[str, float]] = [spec.operating_point] if spec.recovery else []
+    along: list[Mapping[str, float]] = [spec.operating_point] if spec.recovery or asked_loads(spec) else []
     if any(bound.anywhere for bound in spec.recovery.values()):
         along += [{plant.stroke.name: -plant.stroke.travel}, {plant.stroke.name: plant.stroke.travel}]
     return [
         (linearize(plant, trim(plant, **at)), _slope(plant, at.get(plant.stroke.name, 0.0))) for at in along
     ]
+
+
+def is_driven(spec: Spec) -> bool:
+    """Whether current controllers drive windings in the design's loop."""
+    return _driven_windings(spec) is not None
 
 
 def _driven_windings(spec: Spec) -> Driven | None:
@@ -326,15 +344,26 @@ def _with_windings(spec: Spec, driven: Driven | None, whole: MachinePart) -> Mac
     if driven is None:
         return whole
     x = spec.plant.at(**spec.operating_point).x
-    return MachinePart(*(np.array(ca.DM(M)) for M in with_windings(spec.plant, driven.windings, x, *whole)))
+    return MachinePart(
+        *(np.array(ca.DM(M)) for M in with_windings(spec.plant, driven.windings, x, *whole[:3]))
+    )
 
 
 def _cut(spec: Spec, driven: Driven | None, whole: MachinePart, group: tuple[Any, Any, Any]) -> MachinePart:
-    """A group's part of the machine; of each of its inputs the current in the winding is a state and an output."""
+    """A group's part of the machine, with the lags of its sensors.
+
+    Of each input of a machine with windings the current is a state and an output.
+    """
     i, j, o = group
+    sensors = spec.plant.sensors
+    lags = replace(sensors, lag=tuple(sensors.lag[k] for k in o)) if len(sensors.lagging) else None
     if driven is not None:
         i, o = np.append(i, len(spec.plant.design_states) + j), np.append(o, len(spec.plant.outputs) + j)
-    return MachinePart(whole.A[np.ix_(i, i)], whole.B[np.ix_(i, j)], whole.C[np.ix_(o, i)])
+    part = MachinePart(whole.A[np.ix_(i, i)], whole.B[np.ix_(i, j)], whole.C[np.ix_(o, i)])
+    if lags is None or not len(lags.lagging):
+        return part
+    A, B, read = (np.array(ca.DM(M)) for M in with_lags(lags, part.A, part.B, part.C))
+    return MachinePart(A, B, pad(part.C, len(A)), read)
 
 
 def _place(
@@ -350,7 +379,8 @@ def _place(
     whole = _with_windings(spec, driven, MachinePart(model.A, model.B, model.C))
     part = _cut(spec, driven, whole, group)
     machine = _sample(spec, driven, part, forecast)
-    pushed = push_through(part.A, disturbance_map(model)[i], spec.sample_time, len(machine.Ad))
+    B_w = disturbance_map(model)[i]
+    pushed = push_through(part.A, B_w, spec.sample_time, len(machine.Ad), machine.caught)
     return StrokePlace(
         position_in(model.plant, model.operating_point.x), machine, slope[np.ix_(j, o)], pushed
     )
@@ -364,6 +394,11 @@ def _pushes(spec: Spec, outputs: Any, places: Sequence[StrokePlace]) -> tuple[An
         push = np.abs([place.pushed @ bound.load_at(place.position) for place in places]).round(15)
         if push.any() and names & set(bound.outputs):
             bounds.append((bound.after or 0.0, bound.anywhere, bound.limit, push.tobytes()))
+    names_of_loads = [s.name for s in spec.plant.disturbances]
+    for name, size in asked_loads(spec).items():
+        push = np.abs(places[0].pushed[:, names_of_loads.index(name)]).round(15)
+        if push.any():
+            bounds.append((math.inf, False, size, push.tobytes()))
     machines = (np.abs(place.machine.Ad).round(12).tobytes() for place in places)
     return (*sorted(bounds), *machines)
 
@@ -384,18 +419,25 @@ def _estimates(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
 
 
 def _sample(spec: Spec, driven: Driven | None, part: MachinePart, forecast: FloatArray) -> SampledMachine:
-    """A part behind its current loops: from forces, and where there is a forecast from voltages beside them."""
-    A, B, C = part
-    actuator, m, Ts = spec.plant.actuator, B.shape[1], spec.sample_time
-    delay = actuator.delay(Ts)
+    """A part behind its current loops and sensors: from forces, and with a forecast from voltages beside them."""
+    actuator, (A, B, C, read), Ts = spec.plant.actuator, part, spec.sample_time
+    m, delay, count = B.shape[1], actuator.delay(Ts), len(C) - (0 if driven is None else B.shape[1])
+    read = (read if read.size else C)[:count]
+    late, rest = split_dead_time(spec.plant.sensors.dead_time, Ts)
+    caught = Caught(read, Ts - rest) if rest else None
     if driven is not None:
-        Ad, Bd = sample_driven((A, B, C[-m:]), driven.loop, driven.windings.R, Ts, delay)
-        C, Bd = C[:-m], Bd if forecast.any() else Bd[:, :m]
+        Ad, Bd = sample_driven((A, B, C[-m:]), driven.loop, driven.windings.R, Ts, delay, caught=caught)
+        Bd = Bd if forecast.any() else Bd[:, :m]
     else:
         if math.isfinite(actuator.crossover):
             A, B = add_lags(A, B, actuator.crossover)
-        Ad, Bd = sample(A, B, Ts, delay)
-    return SampledMachine(Ad, Bd, np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))]))
+        Ad, Bd = sample(A, B, Ts, delay) if caught is None else caught.add_to((A, B), Ts, delay)
+    first = len(Ad) - count - (0 if driven is None else m)
+    Cd = pad(read, len(Ad)) if caught is None else np.eye(len(Ad))[first : first + count]
+    if late:
+        Ad, Bd, Cd = stored_readings(Ad, Bd, Cd, late)
+    at = None if caught is None else (first, caught._replace(C=pad(read, len(part.A))))
+    return SampledMachine(Ad, Bd, Cd, pad(C[:count], len(Ad)), at)
 
 
 def _intervals(spec: Spec) -> dict[str, tuple[float, ...]]:
@@ -425,10 +467,10 @@ def _corners(
             key = b"".join(np.abs(M).round(9).tobytes() for part in parts for M in part)
             if key not in made:
                 made[key] = [_sample(spec, driven, part, forecast) for part in parts]
-    stacked = (
-        np.array([[getattr(m, name) for m in one] for one in made.values()]) for name in ("Ad", "Bd", "Cd")
-    )
-    return SampledMachine(*(M.swapaxes(0, 1) for M in stacked))
+    names = "Ad", "Bd", "Cd", "true"
+    stacked = (np.array([[getattr(m, name) for m in one] for one in made.values()]) for name in names)
+    Ad, Bd, Cd, true = (M.swapaxes(0, 1) for M in stacked)
+    return SampledMachine(Ad, Bd, Cd, true)
 
 
 def figures_of(spec: Spec, group: TuningGroup, weights: Weights, delay: float) -> dict[str, float]:
@@ -460,9 +502,14 @@ def figures_of_gains(spec: Spec, group: TuningGroup, g: Gains) -> dict[str, floa
         known = (len(g.Ad) - len(group.states)) // len(group.inputs) - bool(spec.weights.drift_variance.size)
     resting = known if spec.current_lag else 0
     w_n = _natural_frequency(group, g, resting) if spec.plant.second_order else math.inf
-    peak, bandwidth = _response(group, steady, Ts, w_n=w_n, alone=alone)
+    sizes = reading_sizes(spec.plant, None if spec.pid is not None else spec.weights.sensor_variance)
+    peak, bandwidth = _response(group, steady, Ts, sizes, w_n=w_n, alone=alone)
+    pushed = [_pushed_loop(group, place, g, law) for place in group.places]
     try:
-        answers = tuple((place.position, _answer(group, place, g, law, Ts)) for place in group.places)
+        answers = tuple(
+            (place.position, _answer(place, *one, Ts))
+            for place, one in zip(group.places, pushed, strict=True)
+        )
     except CheckError:
         return {}
     margins = None if group.corners is None else corner_margins(group.corners, _with_forecast(group, g, law))
@@ -478,6 +525,7 @@ def figures_of_gains(spec: Spec, group: TuningGroup, g: Gains) -> dict[str, floa
         answers=answers,
         recovery=spec.recovery,
         follow=_follower(spec, group, g, closed, known),
+        largest_load=partial(_largest_load, spec.plant, group, pushed),
     )
     figures = {}
     for name, signal, requirement in group.requirements:
@@ -510,7 +558,7 @@ def _follower(
         v = g.K @ xi + Ts * g.Ki @ p + v_ff
         driven = np.concatenate([Bd @ v, g.Bd @ v, Ts * p])[: len(closed)]
         states = np.linalg.solve(np.exp(1j * w * Ts) * np.eye(len(closed)) - closed, driven)
-        return np.asarray(group.nominal.Cd @ states[: group.nominal.Cd.shape[1]])
+        return np.asarray(group.nominal.true @ states[: group.nominal.true.shape[1]])
 
     return follow
 
@@ -520,24 +568,39 @@ def _with_forecast(group: TuningGroup, g: Gains, law: LinearLaw) -> LinearLaw:
     return with_estimated_emf(law, estimated_rows(group.forecast, g.L, g.Cd)) if group.forecast.size else law
 
 
-def _answer(group: TuningGroup, place: StrokePlace, g: Gains, law: LinearLaw, Ts: float) -> StepResponse:
-    """Outputs of a group under a unit step of each load from outside. Raises CheckError for an unstable loop."""
+def _pushed_loop(
+    group: TuningGroup, place: StrokePlace, g: Gains, law: LinearLaw
+) -> tuple[FloatArray, FloatArray]:
+    """The closed loop of a group at a place, and what unit loads from outside leave in its states."""
     closed = place.machine.close(_with_forecast(group, g, law._replace(D_y=law.D_y + place.slope)))
-    k = len(law.A)
-    pushed = np.vstack([place.pushed, np.zeros((k, place.pushed.shape[1]))])
-    C = np.hstack([place.machine.Cd, np.zeros((len(place.machine.Cd), k))])
-    return step_response(closed, pushed, C, Ts)
+    return closed, pad(place.pushed.T, len(closed)).T
+
+
+def _largest_load(
+    plant: Plant, group: TuningGroup, pushed: Sequence[tuple[FloatArray, FloatArray]], disturbance: str
+) -> float | None:
+    """`TrialFigures.largest_load` of a trial, at the operating point."""
+    k = [s.name for s in plant.disturbances].index(disturbance)
+    closed, left = pushed[0]
+    return largest_trial_load(group.contacts, closed, left[:, k], len(group.states))
+
+
+def _answer(place: StrokePlace, closed: FloatArray, pushed: FloatArray, Ts: float) -> StepResponse:
+    """Outputs of a group under a unit step of each load from outside. Raises CheckError for an unstable loop."""
+    return step_response(closed, pushed, pad(place.machine.true, len(closed)), Ts)
 
 
 def _response(
-    group: TuningGroup, law: LinearLaw, Ts: float, *, w_n: float, alone: bool
+    group: TuningGroup, law: LinearLaw, Ts: float, sizes: FloatArray | None, *, w_n: float, alone: bool
 ) -> tuple[float, float]:
     """Peak sensitivity and bandwidth, rad/s; w_n: the smallest natural frequency, infinite where there is none.
+
+    sizes : of all readings, see `reading_sizes`
 
     Of several groups, the loop gain's last crossing is that of the widest: it binds a group that stands alone.
     """
     machine = SampledLoop(group.nominal.Ad, group.nominal.Bd, group.nominal.Cd, law, Ts)
-    cut = Nominal(*machine.systems, True, Ts)
+    cut = in_sizes(Nominal(*machine.systems, True, Ts), sizes, group.outputs)
     bandwidth = min(tracked_band(cut, min(len(group.outputs), len(group.inputs)))[0], w_n)
     if alone:
         bandwidth = min(bandwidth, last_crossover(cut))
@@ -557,7 +620,7 @@ def _noise(group: TuningGroup, law: LinearLaw, closed: FloatArray) -> NoiseRms:
     noise = np.vstack([group.nominal.Bd @ law.D_y, law.B_y])
     X = covariance(closed, noise * group.variance @ noise.T)
     k = len(group.nominal.Ad)
-    out = group.nominal.Cd @ X[:k, :k] @ group.nominal.Cd.T
+    out = group.nominal.true @ X[:k, :k] @ group.nominal.true.T
     command = np.hstack([law.D_y @ group.nominal.Cd, law.C])
     force = np.diag(command @ X @ command.T + law.D_y * group.variance @ law.D_y.T)[: len(group.inputs)]
     return NoiseRms(np.sqrt(np.diag(out)), np.sqrt(force))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from malta.margins.loop_report import LoopReport, Outcome
+from malta.margins.loop_report import LoopReport
+from malta.margins.outcome import Outcome
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 from malta.tuning.outcomes import judge_controller

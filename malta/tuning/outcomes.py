@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,11 +12,13 @@ from malta.errors import InputError
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.noise import noise_of
 from malta.loops.time_domain import bounded_deviation, worst_along
-from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
+from malta.loops.waveforms import largest_load
+from malta.margins.loop_report import BANDWIDTHS, LoopReport
+from malta.margins.outcome import Outcome
 from malta.margins.verify import linear_report
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
-from malta.simulation.experiments import Experiment
+from malta.simulation.experiments import Experiment, whole_experiment
 from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
@@ -24,6 +26,7 @@ from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import Figure, NoiseRms, Requirement, base_of, requirements_for
 from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
+from malta.work import WorkUp, is_stopped
 
 if TYPE_CHECKING:
     from malta.synthesis.recovery import RecoveryBound
@@ -82,12 +85,14 @@ class SynthesizedDesign:
             return Figure(worst, f"linear loop, at {1e3 * position:.3g} mm")
         return Figure(bounded_deviation(self.plant, self.controller, bound), "linear loop")
 
+    def largest_load(self, disturbance: str) -> Figure:
+        """The largest load that touches no contact, whatever its waveform, at the operating point."""
+        size, contact = largest_load(self.loop, disturbance)
+        return Figure(size, f"linear loop, to {contact}")
+
     def fly(self, name: str, **options: Any) -> Experiment:
-        """Run an experiment of the machine. Raises KeyboardInterrupt when Ctrl-C cut the experiment short."""
-        e = experiment(name, self.plant, self.controller, **options)
-        if e.interrupted or any(case.run.verdict.name == "interrupted" for case in e.cases):
-            raise KeyboardInterrupt
-        return e
+        """Run an experiment of the machine. Raises as `whole_experiment` where it was cut short."""
+        return whole_experiment(experiment(name, self.plant, self.controller, **options))
 
     def simulate(self, parameters: Parameters, scenario: Scenario) -> Trajectory:
         """Run a scenario on a machine with other parameters. Raises KeyboardInterrupt as `fly`."""
@@ -98,15 +103,34 @@ class SynthesizedDesign:
 
 
 def judge_controller(
-    spec: Spec, controller: Controller, names: Collection[str], verified: LoopReport | None = None
+    spec: Spec,
+    controller: Controller,
+    names: Collection[str],
+    verified: LoopReport | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[Outcome, ...]:
-    """Measure requirements of a design with a controller: see judging.judge."""
+    """Measure requirements of a design with a controller, those for which there is time: see judging.judge."""
     model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
     design = SynthesizedDesign(spec, model, controller, verified)
     outcomes = _load_errors(design) if spec.pid else []
-    for name in names:
-        outcomes += outcomes_of(design, name)
+    for k, name in enumerate(names):
+        if is_stopped():
+            break
+        if progress is not None:
+            progress(k / len(names))
+        try:
+            found = outcomes_of(design, name)
+        except WorkUp:
+            break
+        is_open = is_stopped() and base_of(name) == "margin" and design.margins.stable
+        outcomes += [] if is_open and not found[0].found else found
     return tuple(outcomes)
+
+
+def open_entries(names: Collection[str], outcomes: Collection[Outcome]) -> list[str]:
+    """The requirements among these entries that were not judged, for lack of time."""
+    judged = {one.name for one in outcomes}
+    return list(dict.fromkeys(base_of(name) for name in names if name not in judged))
 
 
 def entries_without_flights(spec: Spec) -> list[str]:

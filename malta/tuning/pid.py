@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -50,6 +51,7 @@ from malta.tuning.search import (
     model_and_controller,
     separate,
 )
+from malta.work import WorkUp, check_clock, without_limit
 
 # What requirements estimate of a trial of PID gains: noise of forces, answers to loads, margin at corners of the box.
 #
@@ -158,6 +160,7 @@ def parts_of(whole: PidPart) -> list[PidPart]:
                 whole.push[np.ix_(i, o)],
                 whole.shaken[np.ix_(i, i)],
                 whole.forecast[np.ix_(o, np.append(o, m + o))] if whole.forecast.size else whole.forecast,
+                None if whole.true is None else whole.true[np.ix_(o, i)],
             )
         )
     return parts
@@ -178,7 +181,7 @@ def close_loop(part: PidPart, terms: Pid, Ts: float, axes: PidAxisSet | None = N
         linear = with_estimated_emf(linear, estimated_rows(part.forecast, g.L, g.Cd))
     elif part.Bd.shape[1] > k:
         linear = with_readings(linear)
-    return SampledLoop(part.Ad, part.Bd, part.Cd, linear, Ts)
+    return SampledLoop(part.Ad, part.Bd, part.Cd, linear, Ts, part.true)
 
 
 def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
@@ -228,6 +231,7 @@ def _polish(search: TrialSearch, u: FloatArray, trials: int, outputs: Collection
     count = len(_ratios(search.spec, _of(search.figures(u), outputs))) or 1
 
     def error(u: FloatArray) -> float:
+        check_clock()
         tried.append(u.copy())
         figures = _of(search.figures(u), outputs)
         return math.log(load_error(figures)) if figures else 0.0
@@ -236,11 +240,12 @@ def _polish(search: TrialSearch, u: FloatArray, trials: int, outputs: Collection
         return np.log(_ratios(search.spec, _of(search.figures(u), outputs)) or [math.e] * count)
 
     for first, last in RADII:  # once more from the best, as peaks that change places mislead its models
-        optimize.minimize(
-            error, u, method="COBYQA", bounds=optimize.Bounds(np.zeros(len(u)), np.ones(len(u))),
-            constraints=optimize.NonlinearConstraint(bounds, -np.inf, -2 * ROOM),
-            options={"maxfev": trials, "initial_tr_radius": first, "final_tr_radius": last},
-        )  # fmt: skip
+        with suppress(WorkUp):
+            optimize.minimize(
+                error, u, method="COBYQA", bounds=optimize.Bounds(np.zeros(len(u)), np.ones(len(u))),
+                constraints=optimize.NonlinearConstraint(bounds, -np.inf, -2 * ROOM),
+                options={"maxfev": trials, "initial_tr_radius": first, "final_tr_radius": last},
+            )  # fmt: skip
         u = min(tried, key=partial(goal_value, search, outputs=outputs))
     return u
 
@@ -252,8 +257,9 @@ def search_gains(
 
     In a part of several outputs each is searched by itself, twice around, then all together from there.
     """
-    model, controller = model_and_controller(spec)
-    parts, axes = parts_of(whole_machine(model, controller, loads_of(spec))), axes_of(model, spec.axes)
+    with without_limit():
+        model, controller = model_and_controller(spec)
+        parts, axes = parts_of(whole_machine(model, controller, loads_of(spec))), axes_of(model, spec.axes)
     named = zip(pid_signals(spec.plant, spec.axes)["Kp"], axes.of_outputs, strict=True)
     axis = {s.name: set(np.flatnonzero(row).tolist()) for s, row in named}
     everything = set(range(len(axis)))  # what the filter of all axes touches
@@ -261,7 +267,8 @@ def search_gains(
         set[int]().union(*(axis.get(entry.rpartition(".")[2], everything) for entry in variable.entries))
         for variable in spec.search
     ]
-    estimates = estimates_of(spec, outputs)
+    with without_limit():
+        estimates = estimates_of(spec, outputs)
     touched = [{k for k, part in enumerate(parts) if own & set(part.outputs)} for own in outputs]
     clusters, blocks = separate(touched, len(parts)), separate(outputs, len(axis))
     numbers = [len(own) for own, _ in blocks if own]

@@ -10,12 +10,12 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import covariance
 from malta.linear.peaks import smooth_peak
 from malta.linear.sampling import sample, sample_noise
-from malta.loops.bandwidths import last_crossover, tracked_band
+from malta.loops.bandwidths import in_sizes, last_crossover, reading_sizes, tracked_band
 from malta.loops.loop import loop_of_model
-from malta.loops.noise import covariance
-from malta.loops.sampled_loops import SampledLoop
+from malta.loops.sampled_loops import SampledLoop, push_through
 from malta.loops.windings import emf_slope, windings_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
@@ -41,6 +41,7 @@ class PidPart:
     push: FloatArray  # n x k, what constant forces leave in the states after a sample
     shaken: FloatArray  # n x n, covariance that the noise of forces leaves there
     forecast: FloatArray  # k x 2 k, of voltages by positions and rates of the outputs; empty: none
+    true: FloatArray | None  # k x n, outputs of the states where sensors read them late; None: Cd
 
 
 def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> PidPart:
@@ -51,15 +52,21 @@ def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> P
     assert machine.continuous is not None
     A, n = machine.continuous, len(machine.continuous)
     B = np.vstack([loaded.B, np.zeros((n - len(loaded.B), loaded.B.shape[1]))])
-    push, shaken = np.zeros((len(machine.Ad), B.shape[1])), np.zeros_like(machine.Ad)
-    push[:n] = sample(A, B, Ts)[1]
-    shaken[:n, :n] = sample_noise(A, B * (np.square(loads.force_noise) * Ts) @ B.T, Ts)
+    push, shaken = push_through(A, B, Ts, len(machine.Ad), machine.caught), np.zeros_like(machine.Ad)
+    W = B * (np.square(loads.force_noise) * Ts) @ B.T
+    shaken[:n, :n] = sample_noise(A, W, Ts)
+    if machine.caught is not None:  # readings within the sample
+        first, (C, time) = machine.caught
+        own, then = slice(first, first + len(C)), C @ sample_noise(A, W, time)
+        shaken[own, own] = then @ C.T
+        shaken[own, :n] = then @ sample(A, B, Ts - time)[0].T
+        shaken[:n, own] = shaken[own, :n].T
     slope = np.zeros((B.shape[1], len(machine.Cd)))
     if plant.has_stroke:
         slope[:, plant.stroke_output] = controller.feedforward.slope(position_in(plant, x))
     return PidPart(
         tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken,
-        _forecast(model, controller, machine),
+        _forecast(model, controller, machine), machine.true,
     )  # fmt: skip
 
 
@@ -88,19 +95,20 @@ def loop_figures(spec: Spec, part: PidPart, loop: SampledLoop) -> dict[str, floa
     found = {}
     pushed = np.vstack([part.push * np.array(loads.load)[own], np.zeros((len(c.A), len(own)))])
     for name, row, x in zip(
-        names, loop.Cd, np.linalg.solve(np.eye(len(closed)) - closed, pushed).T, strict=True
+        names, loop.outputs, np.linalg.solve(np.eye(len(closed)) - closed, pushed).T, strict=True
     ):
         X = covariance(closed, np.outer(x, x))  # it starts at -x from where it ends
         found[f"load_error {name}"] = math.sqrt(Ts * float(row @ X[:n, :n] @ row))
     noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
     W = noise * np.square(np.array(loads.sensor_noise)[own]) @ noise.T
     W[:n, :n] += part.shaken
-    motion = np.sqrt(np.diag(loop.Cd @ covariance(closed, W)[:n, :n] @ loop.Cd.T))
+    motion = np.sqrt(np.diag(loop.outputs @ covariance(closed, W)[:n, :n] @ loop.outputs.T))
     found |= {f"noise_motion {name}": value for name, value in zip(names, motion.tolist(), strict=True)}
     cut = loop.cut
     found |= {f"peak_sensitivity {name}": smooth_peak(cut.sensitivity(i)) for i, name in enumerate(names)}
     if "bandwidth" in spec.specification:
-        found["bandwidth"] = min(tracked_band(cut)[0], last_crossover(cut))
+        scaled = in_sizes(cut, reading_sizes(spec.plant, None), own)
+        found["bandwidth"] = min(tracked_band(scaled)[0], last_crossover(scaled))
     return found
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +29,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import base_of, requirements_for
 from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
+from malta.work import WorkUp, check_clock, without_limit
 from malta.writing import replace_files
 
 Progress = Callable[[float], None]
@@ -138,7 +140,8 @@ class Journal:
     def get(self, key: str, compute: Callable[[], dict[str, float]]) -> dict[str, float]:
         """Return the figures of a trial: those of the journal, or computed ones, which the journal then holds."""
         if key not in self.known:
-            self.known[key] = compute()
+            with without_limit():  # the clock ends a search between its trials
+                self.known[key] = compute()
             if self.path is not None:
                 with self._write_locked(self.path), self.path.open("a", encoding="utf-8") as file:
                     file.write(json.dumps([key, self.known[key]]) + "\n")
@@ -189,20 +192,34 @@ class TrialSearch:
         return self.journal.get(key, lambda: self.compute(self.spec.vary(every)))
 
     def evolve(self, goal: Callable[[FloatArray], float], generations: int) -> FloatArray:
-        """Find the region: differential evolution from a Latin hypercube with the file's own numbers in it."""
+        """Find the region: differential evolution from a Latin hypercube with the file's own numbers in it.
+
+        Where the clock ends the search, its best member is what is found.
+        """
         if not (generations and len(self.low)):
             return self.start
+        least, best = math.inf, self.start
+
+        def look(u: FloatArray) -> float:
+            nonlocal least, best
+            check_clock()
+            value = goal(u)
+            if value < least:
+                least, best = value, u.copy()
+            return value
+
         rng = np.random.default_rng(0)
         k, members = len(self.low), max(8 * len(self.low), 6)
         cube = (
             rng.permuted(np.tile(np.arange(members), (k, 1)), axis=1).T + rng.random((members, k))
         ) / members
         cube[0] = self.start
-        found = optimize.differential_evolution(
-            goal, optimize.Bounds(np.zeros(k), np.ones(k)), maxiter=generations, init=cube, seed=0,
-            tol=1e-6, polish=False, mutation=(0.4, 0.9), recombination=0.8,
-        )  # fmt: skip
-        best: FloatArray = np.asarray(found.x, dtype=float)
+        with suppress(WorkUp):
+            found = optimize.differential_evolution(
+                look, optimize.Bounds(np.zeros(k), np.ones(k)), maxiter=generations, init=cube, seed=0,
+                tol=1e-6, polish=False, mutation=(0.4, 0.9), recombination=0.8,
+            )  # fmt: skip
+            best = np.asarray(found.x, dtype=float)
         return best
 
 

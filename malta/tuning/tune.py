@@ -25,16 +25,16 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.margins.loop_report import Outcome
+from malta.margins.outcome import Outcome
 from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
-from malta.model.plant import Plant
+from malta.model.plant import Plant, whole_samples
 from malta.synthesis.requirements import Trade, base_of, ratio_of, requirements_for
 from malta.synthesis.spec import Spec
 from malta.synthesis.weighting import Weights
 from malta.tuning import groups, pid
 from malta.tuning.descent import BoundPenalty, descend
-from malta.tuning.groups import STEP, TuningGroup, figures_of, groups_of
+from malta.tuning.groups import STEP, TuningGroup, figures_of, groups_of, is_driven
 from malta.tuning.judging import judge
 from malta.tuning.search import (
     DIGITS,
@@ -52,6 +52,7 @@ from malta.tuning.search import (
     model_and_controller,
     separate,
 )
+from malta.work import count_work, is_stopped, without_limit
 
 FRONT = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the margin that is asked for
 MIN_RATIO = 1e-3  # ratio below which a figure counts as nothing
@@ -181,7 +182,8 @@ def search_weights(
 
     Raises InputError for a machine whose groups no LQG can be searched for, and for a variable without effect.
     """
-    clusters = clusters_of(spec)
+    with without_limit():
+        clusters = clusters_of(spec)
     journal.expect(_count_trials(clusters, spec, effort), progress)
     found: dict[float, list[tuple[TrialSearch, FloatArray]]] = {}
     for delay in spec.delays:
@@ -220,6 +222,8 @@ def _front(
         trials += frugal_trials(spec, places, trade, effort.front)
     proven = []
     for one in trials:
+        if is_stopped():
+            return ()  # which of them is better is not known
         if one.figures and (one is best or _beside_noise(spec, one.figures) <= 1.005):
             design = apply_trial(spec, one)
             bound = travel_margin(spec.plant, model_and_controller(design)[1], spec.uncertainty).lower
@@ -239,6 +243,8 @@ def frugal_trials(
     most = min(1 / share for share in spec.uncertainty.values()) - 2 * STEP
     around = [u for _, u in places]
     for share in FRONT:
+        if is_stopped():
+            return
         if share * margin > most:
             continue
         for k, (search, _) in enumerate(places):
@@ -271,13 +277,13 @@ class TuningResult:
 
     spec: Spec  # with the weights that were found
     trial: Trial
-    requirements: tuple[Outcome, ...]
+    requirements: tuple[Outcome, ...]  # none where the search was ended before they were judged
     front: tuple[Trial, ...]  # by margin: least bearing force noise, least motion; and the trial itself
     trials: int
 
     @property
     def reached(self) -> bool:
-        """Whether every requirement holds."""
+        """Whether every requirement holds that was judged."""
         return all(r.holds for r in self.requirements)
 
     @property
@@ -290,6 +296,7 @@ class TuningResult:
         """What was asked for, and what was found."""
         rows = tuple((outcome.verdict, str(outcome)) for outcome in self.requirements)
         word = "reached" if self.reached else "not reached"
+        word = word if self.requirements else "not judged"
         return Description(f"Tuned {self.spec.name!r} in {self.trials} trials: {word}", rows)
 
 
@@ -299,6 +306,7 @@ def tune(
     *,
     effort: Effort = Effort(),  # noqa: B008
     restart: bool = False,
+    time: float | None = None,
     progress: Progress | None = None,
 ) -> TuningResult:
     """Search the numbers of [search] in a design file for the figures of [specification].
@@ -307,12 +315,13 @@ def tune(
     journal : file of the trials; what is in it is not computed again; None: none is written
     effort : generations of the search, trials that polish its best, and trials for the Pareto front
     restart : forget what is in the journal
+    time : s, of the search, whose best design is then judged; None: as long as `effort` takes
     progress : called with the share of the work that is done, 0 to 1
 
     Returns a Tuned: the `spec` with the numbers that were found, its `requirements`, and the Pareto `front`.
 
-    Raises InputError when the design file asks for nothing or lets nothing vary, for a machine whose sensors read late,
-    and when the journal is another search's.
+    Raises InputError when the design file asks for nothing or lets nothing vary, for a dead time that no margin can be
+    proven with, and when the journal is that of another search.
 
     >>> import malta
     >>> from malta.tuning.search import Effort
@@ -327,16 +336,16 @@ def tune(
         )
     if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")
-    if spec.plant.sensors.late:
-        found = "sensors that read late"
-        raise InputError(spec.path, "machine", found, "sensors without lag: verify takes the lag of a design")
     if not spec.search:
         raise InputError(spec.path, "search", "nothing", "a table of the numbers that may vary")
+    if "margin" in spec.specification and is_driven(spec):
+        whole_samples(spec.plant, spec.sample_time)  # before the search, which a proof follows
     trials = Journal(journal, problem_sha256(spec), restart=restart)
     search = pid.search_gains if spec.pid else search_weights
-    trial, front = search(spec, trials, effort, progress)
+    with count_work(math.inf, time):
+        trial, front = search(spec, trials, effort, progress)
     chosen = apply_trial(spec, trial)
-    requirements = judge(chosen)
+    requirements = () if is_stopped() else judge(chosen)
     if progress is not None:
         progress(1.0)
     return TuningResult(chosen, trial, requirements, front, len(trials.known))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,13 +20,15 @@ from malta.margins.travel import LoopAlong
 from malta.margins.verify import linear_report, staged_report
 from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import Plant
+from malta.model.plant import Plant, given_plant
 from malta.model.plants import plant_of
 from malta.model.soundness import unproven
 from malta.proof.margin import Progress, Ranges
 from malta.simulation.experiments.payloads import payload
-from malta.synthesis.controller import Controller
-from malta.tuning.outcomes import entries_without_flights, judge_controller
+from malta.synthesis.controller import Controller, given_law
+from malta.synthesis.requirements import Payload
+from malta.tuning.outcomes import entries_without_flights, judge_controller, open_entries
+from malta.work import NO_TIME, WorkUp, is_stopped, without_limit
 
 if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
@@ -123,14 +126,28 @@ def verify(
         found = replace(
             found, notes=(*found.notes, _schedule_note(model.plant, controller, time, proof=proof))
         )
-    plant = model.plant
-    if worst_case is None:
+    plant, stopped = model.plant, is_stopped()
+    if worst_case is None and not stopped:
         whole = controller.schedule is None and bool(box)
         worst_case = proof and whole and LoopAlong(plant, controller, tuple(box), current_loops).covers_travel
-    worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
+    asked = worst_case and not stopped
+    worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if asked else {}
     reach((1 + MARGIN_SHARE) / 2)
-    carried = payload(plant, controller) if found.stable and proof else None
-    return with_requirements(replace(found, worst=worst, payload=carried), spec, proof=proof, flights=flights)
+    carried = _payload_in_time(plant, controller) if found.stable and proof else None
+    found = replace(found, worst=worst, payload=carried)
+    if proof and is_stopped() and (found.robust is None or found.robust.lower is None):
+        ended = "the search of the margin ended early: what is asked of it was not judged"
+        proof, found = False, replace(found, notes=(*found.notes, ended))
+    with nullcontext() if flights else without_limit():  # without flights it takes no time
+        return with_requirements(found, spec, proof=proof, flights=flights)
+
+
+def _payload_in_time(plant: Plant, controller: Controller) -> Payload | None:
+    """The payload; None where there is no time for it."""
+    try:
+        return None if is_stopped() else payload(plant, controller)
+    except WorkUp:
+        return None
 
 
 def _schedule_note(plant: Plant, controller: Controller, time: float | None, *, proof: bool) -> str:
@@ -147,8 +164,15 @@ def _schedule_note(plant: Plant, controller: Controller, time: float | None, *, 
     return f"{of}; with the machine at its reference, nominal: {bound} {unit}/s"
 
 
-def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flights: bool) -> LoopReport:
-    """Add the requirements of a design file; a note says where they cannot be judged.
+def with_requirements(
+    found: LoopReport,
+    spec: Spec | None,
+    *,
+    proof: bool,
+    flights: bool,
+    progress: Callable[[float], None] | None = None,
+) -> LoopReport:
+    """Add the requirements of a design file; a note says where they cannot be judged, or are not for lack of time.
 
     proof : whether the margin is among them, where flights are not
     """
@@ -163,12 +187,14 @@ def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flig
     same = found.current_loops == LAST_STAGE and dict(found.uncertainty) == dict(spec.uncertainty)
     known = "margin" not in names or (same and found.robust is not None)
     try:
-        outcomes = judge_controller(spec, found.controller, names, found if known else None)
+        outcomes = judge_controller(spec, found.controller, names, found if known else None, progress)
     except (InputError, CheckError) as error:
         if isinstance(error, CheckError) and not flights:
             raise
         return replace(found, notes=(*found.notes, f"the requirements were not judged: {error}"))
-    return replace(found, requirements=outcomes)
+    left = open_entries(names, outcomes)
+    notes = (*found.notes, *([f"not judged, {NO_TIME}: {' '.join(left)}"] if left else []))
+    return replace(found, requirements=outcomes, notes=notes)
 
 
 def _model_and_controller(
@@ -181,5 +207,6 @@ def _model_and_controller(
         found = "no controller" if controller is None else "two controllers"
         raise InputError("verify", "", found, "a gain file, a controller, or a machine and its controller")
     if isinstance(loop, LinearModel):
-        return loop, controller
-    return linearize(loop, loop.point(controller.operating_point[0])), controller
+        return loop, given_law("verify", controller)
+    plant, controller = given_plant("verify", loop), given_law("verify", controller)
+    return linearize(plant, plant.point(controller.operating_point[0])), controller

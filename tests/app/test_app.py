@@ -100,6 +100,24 @@ def test_linear_run_is_what_the_simulation_does() -> None:
     assert np.abs(np.array(linear["p"]).T - run.p[::step]).max() < 0.1e-6
 
 
+def test_the_worst_load_of_the_page_is_the_one_that_is_flown() -> None:
+    """Of the load that is chosen under Load: linear as the l1 norm of its contact says, and so the simulation."""
+    from malta.app.picture import planned_run, run_names
+
+    problem = solve(open_design(BALL).apply(Edit()))
+    plant, controller = problem.plant, problem.controller
+    assert "worst load" in run_names(plant, controller)
+    name, planned = planned_run(plant, controller, "worst load", "w")
+    assert name == "worst load w"
+    linear = picture(problem, View("worst load", "w"), margin=False)["run"]
+    run = malta.simulate(plant, controller, planned.scenario)
+    worst = malta.worst_waveform(malta.loop(plant, controller), "w", "y", 1.0)
+    most = np.abs(np.array(linear["p"][0])).max()
+    assert most == pytest.approx(worst.value, rel=0.02)  # the page draws some of the samples
+    assert np.abs(run.p[:, 0]).max() == pytest.approx(worst.value, rel=0.05)
+    assert picture(problem, View("worst load", "F_q"), margin=False)["run"] is None
+
+
 @pytest.mark.parametrize("design", [BALL, *SLOW])
 def test_eigenvalue_margin_lies_just_above_the_proven_one(design: Path) -> None:
     spec = malta.read_design(design)
@@ -114,6 +132,7 @@ def test_eigenvalue_margin_lies_just_above_the_proven_one(design: Path) -> None:
     assert again.upper == pytest.approx(bound.upper, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_margin_map_and_the_poles_at_its_points_agree(tmp_path: Path) -> None:
     """Eigenvalues of the sampled loop on a grid, and the machine's own loop at a point: two routes to the boundary."""
     page = Client(copied(tmp_path), tmp_path)
@@ -240,6 +259,17 @@ def test_every_field_moves_the_design_or_says_why_not(design: Path, tmp_path: Pa
                 found = client.ask("evaluate", number=number, values={key: value}, redesign=redesign)
                 assert "poles" in found or "defect" not in found["error"], (key, value, redesign, found)
                 json.dumps(found, allow_nan=False)
+
+
+def test_a_run_of_an_unstable_loop_ends_where_it_leaves(tmp_path: Path) -> None:
+    """It is drawn until an output is off by all that it was asked to move: the axis shows the departure."""
+    client = Client(copied(tmp_path), tmp_path)
+    found = client.ask("evaluate", number=1, values={"pid.Kp.F_x": -3000.0})
+    assert not found["stable"]
+    run = found["run"]
+    off = np.abs(np.array(run["p"]) - np.array(run["reference"]))
+    assert 0 < off.max() <= np.ptp(np.array(run["reference"]))
+    assert len(run["t"]) > 2
 
 
 def test_unknown_questions_are_refused(tmp_path: Path) -> None:
@@ -426,6 +456,7 @@ def test_figures_of_the_first_answer_are_those_of_verify(
         assert found[label] == pytest.approx(wanted[key], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -682,7 +713,7 @@ def test_workers_follow_the_newest_design_and_prove_it(tmp_path: Path) -> None:
             ]
         found: dict[str, dict[str, Any]] = {}
         after, until = 0, time.monotonic() + 600
-        while time.monotonic() < until and not {"proof", "run", "requirement"} <= set(found):
+        while time.monotonic() < until and not {"proof", "safe", "run", "requirement"} <= set(found):
             answer = session.answer({"ask": "news", "after": after})
             after = answer["after"]
             for item in answer["news"]:
@@ -695,6 +726,9 @@ def test_workers_follow_the_newest_design_and_prove_it(tmp_path: Path) -> None:
     _, controller = model_and_controller(session.files.apply(session.edit).spec)
     spec = session.files.spec
     assert found["proof"]["lower"] == travel_margin(spec.plant, controller, spec.uncertainty).lower
+    safe = malta.safe_load(malta.loop(spec.plant, controller), "F_x")
+    assert found["safe"]["loads"] == {"F_x": f"{safe.proven.text(3)} N"}
+    assert found["safe"]["ends"] == {"F_x": safe.ends}
     judged = [one.holds for one in judge(spec, controller) if one.name == "margin"]
     assert found["proof"]["holds"] == (judged[0] if judged else None)
 

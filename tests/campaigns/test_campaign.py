@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 from conftest import assert_folds, printed, refusal
+from flight import CASES, EXPERIMENTS
 from hypothesis import given, settings, strategies as st
 
 import malta
@@ -28,7 +29,6 @@ from malta.campaigns.result import Campaign, figures_of, rate, runs_within_bound
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
 from malta.campaigns.store import MANIFEST, block_name, read_plan
 from malta.campaigns.summary import worst_of
-from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation.engine import compiled
 from malta.simulation.engine.digest import Batch, verdicts
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from malta.synthesis.controller import Controller
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 MODULE: Any = sys.modules["malta.campaigns.run"]
 BOX = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
 SHORT: dict[str, Any] = {"fidelity": "force", "duration": 0.02, "rise": 3e-3}
@@ -229,6 +229,7 @@ def test_what_is_no_plan_is_refused_in_a_sentence(
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.slow_for("hold", "lift-off", "disturbance", "drive-limits", "carrier")
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_scenario_is_flown_or_refused(controller: Controller, name: str) -> None:
     """Those of CASES complete, and a run of each comes back with the digest of the block; others are refused."""
@@ -245,6 +246,7 @@ def test_every_scenario_is_flown_or_refused(controller: Controller, name: str) -
     assert single.question.startswith(name)
 
 
+@pytest.mark.slow_for("lift-off", "disturbance", "carrier")
 @pytest.mark.parametrize("name", CASES)
 def test_cases_are_those_that_the_experiment_flies(designs: dict[str, Design], name: str) -> None:
     design = designs["calibrated"]
@@ -292,6 +294,7 @@ def _assert_replayed(found: Campaign, row: int, single: malta.simulation.Experim
     np.testing.assert_allclose(batch.rms[row], np.sqrt((error**2).mean(axis=0)), rtol=1e-12, atol=1e-20)
 
 
+@pytest.mark.slow
 def test_runs_do_not_depend_on_blocks_workers_or_company(controller: Controller, tmp_path: Path) -> None:
     """To the bit: blocks of 8, of 24 and of all, on one thread and on three, kept or not, and the blocks' bytes too."""
     plan = _plan(controller, 60)
@@ -315,6 +318,7 @@ def test_without_spread_and_noise_all_are_the_nominal_machine(designs: dict[str,
     np.testing.assert_allclose(found.batch.deviation[7], wanted, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_runs_that_touch_down_are_replayed_to_the_sample(shaky: Controller) -> None:
     """`table2` on machines up to 60 % off: every way to end, each as the single run ends; noise and sensors too."""
     plan = Plan(shaky, "stroke", dict.fromkeys(BOX, 0.6), {"offset_y2": 5e-6}, samples=64)
@@ -337,6 +341,7 @@ def test_runs_that_touch_down_are_replayed_to_the_sample(shaky: Controller) -> N
         replay(plan, 0, engine=cast("Any", "steam"))
 
 
+@pytest.mark.slow
 def test_sensors_in_steps_are_replayed_to_the_bit(controller: Controller) -> None:
     """A last digit may move a reading by a whole step, and that the mover by nanometres: not in a replay, and only
     there. The virtual machine, by itself, agrees to a step."""
@@ -365,6 +370,7 @@ def test_an_odd_number_of_samples_is_recorded_whole(controller: Controller) -> N
         )
 
 
+@pytest.mark.slow
 def test_a_wider_box_has_a_lower_yield(shaky: Controller) -> None:
     shares = []
     for share in (0.05, 0.3, 0.6):
@@ -377,6 +383,7 @@ def test_a_wider_box_has_a_lower_yield(shaky: Controller) -> None:
 # --- what was found ---
 
 
+@pytest.mark.slow
 def test_the_interval_is_clopper_and_pearsons() -> None:
     """Closed forms at the ends; coverage of a share of 0.9 in 100 runs by summing the binomial."""
     assert rate(10_000, 10_000).low == pytest.approx(0.025 ** (1 / 10_000), abs=1e-12)
@@ -391,6 +398,7 @@ def test_the_interval_is_clopper_and_pearsons() -> None:
     assert math.isnan(rate(0, 0).share)
 
 
+@pytest.mark.slow
 def test_figures_count_completed_runs_and_bounds_of_the_published_stroke(
     shaky: Controller, published: dict[str, Any]
 ) -> None:
@@ -696,6 +704,7 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         memory.cache_clear()
 
 
+@pytest.mark.slow
 def test_without_a_compiler_the_campaign_is_the_same(
     controller: Controller, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
@@ -721,6 +730,7 @@ def _texts(figure: Any) -> list[str]:
     return [text.get_text() for text in figure.findobj(matplotlib.text.Text)]
 
 
+@pytest.mark.slow
 def test_figures_have_units_and_published_bounds(shaky: Controller, published: dict[str, Any]) -> None:
     plan = Plan(shaky, "stroke", dict.fromkeys(BOX, 0.6), {"offset_y2": 5e-6}, samples=64)
     found = campaign(plan)

@@ -43,6 +43,7 @@ def _blocks(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.glob("runs_*.npz"))}
 
 
+@pytest.mark.slow
 def test_a_campaign_is_shown_kept_and_read_again(run: Run, tmp_path: Path) -> None:
     arguments = ("campaign", SHAKY, "--samples", "64", "--spread", "60%", "--sensor", "offset_y2=5um")
     code, out, err = run(*arguments, "--out", tmp_path)
@@ -133,6 +134,7 @@ def test_each_campaign_has_a_folder_of_its_own(
     assert len(list((tmp_path / "build" / "campaigns").iterdir())) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_options_of_the_run_reach_it(run: Run, tmp_path: Path) -> None:
     run(
@@ -312,6 +314,25 @@ def test_ctrl_c_keeps_and_shows_what_is_done(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_campaign_that_has_no_time_ends_after_a_block_and_goes_on(run: Run, tmp_path: Path) -> None:
+    arguments = ("campaign", GAINS, "--samples", "1025", *QUICK, "--out", tmp_path)
+    code, _, err = run(*arguments, "--time", "1e-9")
+    assert code == 0
+    assert (
+        _sentence(err) == f"ended after 1024 of 1025 runs, which {tmp_path} keeps; the same command goes on"
+    )
+    code, out, err = run(*arguments, "--time", "1e9")
+    assert (code, err) == (0, "")
+    assert "1025 of 1025 machines" in out
+    code, _, err = run(*arguments, "--time", "1", "--study", "rare")
+    assert (code, _sentence(err)) == (
+        2,
+        "--time: found --study rare, expected one of them: a study ends by itself",
+    )
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_without_a_compiler_it_says_so(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from malta.simulation.engine import compiled

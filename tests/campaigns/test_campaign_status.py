@@ -42,6 +42,7 @@ def _touch(folder: Path, ages: dict[int, float]) -> None:
         os.utime(folder / block_name(first), (at, at))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_whole_campaign_has_the_tables_that_it_ended_with(run: Run, tmp_path: Path) -> None:
     code, whole, _ = run("campaign", GAINS, *COMMON, "--out", tmp_path)
@@ -119,6 +120,7 @@ def _line(err: str) -> str:
     return err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_what_has_no_status_is_one_sentence(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "mine"

@@ -95,6 +95,7 @@ def assert_agrees(found: list[RareEventEstimate], expected: float) -> None:
     assert np.mean([low <= expected <= high for low, high in (f.interval() for f in found)]) >= 0.8
 
 
+@pytest.mark.slow
 def test_a_known_probability_of_1e_7() -> None:
     found = estimates(linear, 4)
     assert_agrees(found, norm.sf(BETA))
@@ -110,6 +111,7 @@ def test_a_known_probability_of_1e_7() -> None:
         assert all(0.2 < level.acceptance < 0.7 for level in one.levels[1:])
 
 
+@pytest.mark.slow
 def test_a_failure_in_every_direction() -> None:
     assert_agrees(estimates(radial, 3), 1e-6)
 
@@ -219,6 +221,7 @@ def test_a_failure_that_one_repetition_finds_is_a_bound() -> None:
     assert found.interval()[1] > norm.sf(2)
 
 
+@pytest.mark.slow
 def test_severities_that_seldom_differ() -> None:
     """Zero in most runs, as commands that are seldom limited; and a mere indicator, which is refused."""
     assert_agrees(estimates(lambda u, _: np.maximum(u[:, 0] - 1.5, 0) / 2.5, 1), norm.sf(4))
@@ -228,6 +231,7 @@ def test_severities_that_seldom_differ() -> None:
         repeated_subset_simulation(linear, 1, samples=1999)
 
 
+@pytest.mark.slow
 def test_limits_are_those_of_the_campaign() -> None:
     plan = shaky(0.3, 256)
     found = campaign(plan)
@@ -269,6 +273,7 @@ def test_a_specification_is_a_limit() -> None:
 QUICK = {"fidelity": "force", "duration": 0.02}
 
 
+@pytest.mark.slow
 def test_the_design_point_comes_again(tmp_path: Path) -> None:
     """Machine, noise and verdict, from a file, to the bit by the compiled engine; workers do not matter."""
     plan = replace(shaky(0.2, 2000), options=QUICK)
@@ -291,6 +296,7 @@ def test_the_design_point_comes_again(tmp_path: Path) -> None:
         read_design_point(path, plan)
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_goes_on(tmp_path: Path) -> None:
     """With the repetitions that are done; damaged ones, and those of another limit, are simulated again."""
     plan = replace(shaky(0.2, 2000), options=QUICK)

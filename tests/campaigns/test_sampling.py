@@ -15,6 +15,7 @@ from malta.campaigns.plan import MAX_RUNS, latin_hypercube, permute, sobol
 from malta.simulation.readings import keys
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**70),
@@ -36,13 +37,15 @@ def test_every_stratum_has_one_point_and_blocks_change_none(
 @pytest.mark.parametrize("size", [3, 4, pytest.param(7, marks=pytest.mark.slow)])
 def test_all_permutations_come_equally_often(size: int) -> None:
     """Chi-squared of so many keys for each: 7 numbers fail with 12 rounds, and with both sides odd."""
-    numbers, times = np.arange(size, dtype=np.uint64), 6
-    every = math.factorial(size)
-    found = Counter(tuple(permute(numbers, size, key).tolist()) for key in keys(3, np.arange(times * every)))
+    every, times = math.factorial(size), 6
+    each = np.repeat(keys(3, np.arange(times * every))[:, None], size, axis=1)
+    numbers = np.broadcast_to(np.arange(size, dtype=np.uint64), each.shape)
+    found = Counter(map(tuple, permute(numbers, size, each).tolist()))
     squares = sum((n - times) ** 2 for n in found.values()) + (every - len(found)) * times**2
     assert chi2.sf(squares / times, every - 1) > 1e-4
 
 
+@pytest.mark.slow
 def test_dimensions_and_neighbours_are_independent() -> None:
     """Correlations of 200 designs are as wide as those of random permutations: 1 / sqrt(n - 1)."""
     n, across, along = 400, [], []

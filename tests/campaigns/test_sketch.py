@@ -54,6 +54,7 @@ def test_quantiles_are_within_the_accuracy_of_those_of_numpy(
     assert (found[0], found[-1]) == (values.min(), values.max())
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(parts=st.lists(st.lists(finite, max_size=40), min_size=1, max_size=8), seed=st.integers(0, 99))
 def test_order_and_grouping_of_merges_change_no_bit(parts: list[list[float]], seed: int) -> None:
@@ -103,3 +104,10 @@ def test_the_rank_of_a_quantile_is_exact_where_values_grow_fast() -> None:
     values.sort()
     found = quantiles(sketch_of(values), [0.3, 0.5, 0.9])
     assert found == pytest.approx(np.quantile(values, [0.3, 0.5, 0.9]), rel=2 * ACCURACY)
+
+
+def test_zeros_beside_other_values_are_zero() -> None:
+    """The bucket of zero reaches to 3e-312, whose middle is no value."""
+    values = np.concatenate([np.zeros(150_000), np.ones(1_000), -np.ones(10)])
+    found = quantiles(sketch_of(values), [0.0, 0.01, 0.5, 0.9, 1.0])
+    assert found.tolist() == [-1.0, 0.0, 0.0, 0.0, 1.0]

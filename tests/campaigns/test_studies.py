@@ -46,6 +46,7 @@ def found() -> Tolerances:
     return tolerances(plan, limit_of(plan, "touchdown"), 0.97)
 
 
+@pytest.mark.slow
 def test_a_largest_spread_is_that_of_a_campaign(found: Tolerances) -> None:
     """The same machines: a campaign with that spread has that very yield, and with 3 % more spread a smaller one."""
     assert [spread.name for spread in found.spreads] == [*BOX, ALL_PARAMETERS]
@@ -63,12 +64,14 @@ def test_a_largest_spread_is_that_of_a_campaign(found: Tolerances) -> None:
     assert math.isnan(spread_of(found, together))
 
 
+@pytest.mark.slow
 def test_a_parameter_that_does_not_matter_may_spread_as_far_as_it_exists() -> None:
     plan = Plan(gains.read(SHAKY), "stroke", {"I_zz": 0.1}, samples=64, options={"fidelity": "force"})
     (spread,) = tolerances(plan, limit_of(plan, "touchdown"), 1.0).spreads
     assert spread.factor == spread.widest == pytest.approx(9.5)
 
 
+@pytest.mark.slow
 def test_a_yield_that_the_others_lose_has_no_spread() -> None:
     plan = shaky(64, 0.4)
     spreads = tolerances(plan, limit_of(plan, "touchdown"), 0.999).spreads
@@ -143,6 +146,7 @@ def test_indices_of_the_g_function() -> None:
     assert np.mean(inside) >= 0.9
 
 
+@pytest.mark.slow
 def test_noise_is_a_factor() -> None:
     """Held still, where the machine barely matters, the noise of a run decides its largest deviation."""
     options = {"fidelity": "force", "duration": 0.02}
@@ -156,6 +160,7 @@ def test_noise_is_a_factor() -> None:
     assert m.total < 0.1
 
 
+@pytest.mark.slow
 def test_the_commands(run: Run, tmp_path: Path) -> None:
     common = ("campaign", SHAKY, *QUICK, "--out", tmp_path)
     code, out, err = run(*common, "--samples", "512", "--study", "sensitivity")

@@ -217,6 +217,7 @@ def _invented(kept: list[weakref.ref[Any]] | None = None) -> Callable[..., RunBl
     return fly
 
 
+@pytest.mark.slow
 def test_no_block_stays_in_memory(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While one is simulated, at most the one before is alive; and while they are read again."""
     made: list[weakref.ref[Any]] = []
@@ -230,6 +231,7 @@ def test_no_block_stays_in_memory(plan: Plan, tmp_path: Path, monkeypatch: pytes
     assert len(made) == 20
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_runs(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three times the runs: less than a tenth more, where their figures alone would be twice as many bytes."""
     monkeypatch.setattr(MODULE, "fly", _invented())
@@ -253,6 +255,7 @@ def test_blocks_grow_with_the_campaign(plan: Plan) -> None:
     assert [*sizes.values()] == [BLOCK, BLOCK, BLOCK, 2 * BLOCK, 4 * BLOCK, LARGE_BLOCK]
 
 
+@pytest.mark.slow
 def test_the_last_run_of_a_hundred_million_is_simulated_alone(shaky: Controller) -> None:
     """Its block of eight, and the run again, without a design of all in memory."""
     count = 100_000_000
@@ -273,6 +276,7 @@ def test_more_runs_than_arrays_take_are_refused(plan: Plan) -> None:
 # --- interruptions ---
 
 
+@pytest.mark.slow
 def test_ctrl_c_anywhere_counts_every_block_once(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

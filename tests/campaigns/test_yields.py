@@ -71,6 +71,7 @@ def test_yields(flown: Campaign, spec: Spec, published: dict[str, Any]) -> None:
     assert yields_of(flown)[1:] == (None, None)
 
 
+@pytest.mark.slow
 def test_yields_of_the_main_job_are_drawn_from_the_designs_uncertainty(
     spec: Spec, published: dict[str, Any], flown: Campaign
 ) -> None:
@@ -82,6 +83,7 @@ def test_yields_of_the_main_job_are_drawn_from_the_designs_uncertainty(
     assert shares[-1] == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_fewer_machines_of_table2_than_of_calibrated_fly_as_published(published: dict[str, Any]) -> None:
     """Ten times 1 % are 10 %; the intervals are far apart."""
     controllers = [gains.read(f"design/gains/{name}.json") for name in ("table2", "calibrated")]

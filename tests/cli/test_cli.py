@@ -31,7 +31,7 @@ from malta.model.plant import Plant
 from malta.report.ledger import Ledger
 from malta.synthesis.spec import Spec
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 ROOT = Path(__file__).parents[2]
 TABLE2, CALIBRATED = "design/gains/table2.json", "design/gains/calibrated.json"
@@ -116,6 +116,7 @@ def test_help_of_each_command_shows_an_example(command: str) -> None:
     assert "--json" in result.output
 
 
+@pytest.mark.slow_for("simulate")
 @pytest.mark.parametrize("command", [pytest.param("verify", marks=pytest.mark.slow), "simulate"])
 def test_example_in_the_help_runs(run: Run, tmp_path: Path, command: str) -> None:
     text = " ".join(CliRunner().invoke(cli.app, [command, "--help"]).output.split())
@@ -138,6 +139,7 @@ def test_help_names_commands_and_exit_codes() -> None:
     assert re.search(r"Commands: design .* verify .* simulate ", text)
 
 
+@pytest.mark.slow_for("arguments1", "arguments2")
 @pytest.mark.parametrize("arguments", [["--help"], ["design", "--help"], ["simulate", "--help"]])
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     heavy = (
@@ -303,6 +305,7 @@ def test_design_without_names_takes_the_folder(
     assert "wrote design/gains/table2.json" in out
 
 
+@pytest.mark.slow_for("a huge integral-table2", "a huge integral-calibrated")
 @pytest.mark.parametrize("base", ["table2", "calibrated"])
 @pytest.mark.parametrize(
     ("design", "code", "found"),
@@ -330,6 +333,7 @@ def test_design_that_cannot_be_computed_names_its_file(
     assert not (tmp_path / "design" / "gains").exists()
 
 
+@pytest.mark.slow_for("touches down", "no solution")
 @pytest.mark.parametrize(
     ("design", "machine", "found"),
     [
@@ -353,6 +357,7 @@ def test_failing_design_leaves_old_gains(
     assert not (tmp_path / "figures").exists()
 
 
+@pytest.mark.slow
 def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path) -> None:
     old = old_gains(tmp_path / "gains", BALLS)
     (tmp_path / "file").write_bytes(b"not a folder")
@@ -364,6 +369,7 @@ def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path
     assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(BALLS)
 
 
+@pytest.mark.slow
 def test_gains_that_cannot_be_written_leave_the_old_figure(run: Run, tmp_path: Path) -> None:
     figures = tmp_path / "figures"
     figures.mkdir()
@@ -404,6 +410,7 @@ def test_gains_are_replaced_by_a_design_that_ends_well_and_by_no_other(run: Run,
     assert (code, replaced) in ((0, [True] * 3), (1, [False] * 3))
 
 
+@pytest.mark.slow
 def test_two_designs_of_one_name_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> None:
     first = shutil.copytree(ROOT / "examples" / "ball", tmp_path, dirs_exist_ok=True) / "design" / "ball.toml"
     second = first.with_name("second.toml")
@@ -437,6 +444,7 @@ def test_bad_input_outweighs_a_failed_check(run: Run, tmp_path: Path) -> None:
 # --- verify ---
 
 
+@pytest.mark.slow
 def test_verify_prints_poles_bandwidths_and_sensitivities(run: Run) -> None:
     code, out, err = run("verify", TABLE2, "--no-proof")
     assert (code, err) == (0, "")
@@ -456,6 +464,7 @@ def test_all_forms_of_a_gain_file_verify_alike(run: Run) -> None:
     assert results[0][0] == 0
 
 
+@pytest.mark.slow
 def test_verify_of_an_unstable_machine_fails_after_printing(run: Run) -> None:
     code, out, err = run("verify", CALIBRATED, "--set", "K_A=50000")
     assert code == 1
@@ -510,6 +519,7 @@ def test_published_data_without_a_figure_of_a_table_names_it(
     assert not (tmp_path / "design" / "gains").exists()
 
 
+@pytest.mark.slow
 def test_what_the_paper_does_not_print_is_not_shown(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -548,6 +558,7 @@ def test_simulate_prints_the_stroke_beside_the_published_one(run: Run) -> None:
     assert max(map(len, out.splitlines())) <= WIDTH
 
 
+@pytest.mark.slow
 def test_simulate_wraps_long_texts_and_keeps_paths(run: Run, tmp_path: Path) -> None:
     path = tmp_path / f"{'w' * 120}.json"
     shutil.copy(ROOT / TABLE2, path)
@@ -587,6 +598,7 @@ def test_touchdown_as_json_is_said_in_the_verdict(run: Run) -> None:
     assert one_sentence(err)
 
 
+@pytest.mark.slow
 def test_simulate_writes_figure_and_time_series(run: Run, tmp_path: Path) -> None:
     assert run("simulate", CALIBRATED, "--out", tmp_path / "new" / "folder")[::2] == (0, "")
     folder = tmp_path / "new" / "folder"
@@ -616,6 +628,7 @@ def test_noise_repeats_with_its_seed(run: Run) -> None:
     assert run(*noisy, "3") != run(*noisy, "4")
 
 
+@pytest.mark.slow
 def test_options_of_the_stroke_are_taken(run: Run) -> None:
     def stroke(*options: str) -> dict[str, float]:
         code, out, _ = run("simulate", CALIBRATED, "--json", *options)
@@ -636,7 +649,7 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
 
 
 def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
-    from malta.machines.tubular.experiments import CASES, EXPERIMENTS
+    from flight import CASES, EXPERIMENTS
 
     for command, names in (("simulate", EXPERIMENTS), ("campaign", CASES)):
         code, out, err = run(command, CALIBRATED, "--scenario", "help")
@@ -670,7 +683,7 @@ OLD = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCENARIO_FIELDS if name != "settle"])  # which had none
+@pytest.mark.parametrize("name", [name for name in SCENARIO_FIELDS if name not in ("settle", "accuracy")])
 def test_a_general_option_is_that_of_its_old_flag(run: Run, name: str) -> None:
     """--option delay=2 for --delay 2: options of the version before work, and say what to write."""
     value = (OLD | {"fidelity": "dq", "noise": "2"}).get(name)
@@ -743,6 +756,7 @@ def test_options_of_a_scenario_come_with_their_units(run: Run) -> None:
     assert held == run("simulate", CALIBRATED, "--json", "--scenario", "faults", "--option", "during=hold")
 
 
+@pytest.mark.slow
 def test_a_scenario_of_several_runs_writes_each_and_one_figure(run: Run, tmp_path: Path) -> None:
     code, out, err = run("simulate", CALIBRATED, "--scenario", "tilt", "--out", tmp_path)
     assert (code, err) == (0, "")
@@ -752,6 +766,7 @@ def test_a_scenario_of_several_runs_writes_each_and_one_figure(run: Run, tmp_pat
     assert names == ["calibrated_tilt.png", *runs]
 
 
+@pytest.mark.slow
 def test_findings_are_no_failures(run: Run) -> None:
     """Faults that end in touchdown are what was asked for; a lift-off that does not lift is a failure."""
     code, out, err = run("simulate", TABLE2, "--scenario", "payload", "--json")
@@ -801,6 +816,7 @@ def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch
         cached.cache_clear()
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules["malta.simulation.simulate"]
     looked = 0
@@ -861,6 +877,9 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
 # --- bad input ---
 
 
+@pytest.mark.slow_for(
+    "design examples/ball/design/ball.toml --out pyproject.toml/gains-pyproject.toml/gains/ball.json-a place"
+)
 @pytest.mark.parametrize(
     ("arguments", "found", "expected"),
     [
@@ -950,6 +969,7 @@ def test_edited_gain_file_is_refused(run: Run, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_design_that_cannot_be_written_leaves_old_gains(run: Run, tmp_path: Path) -> None:
     old = old_gains(tmp_path / "gains", BALLS)
     blocked = tmp_path / "gains" / "ball.mat"
@@ -1033,6 +1053,7 @@ def test_version(run: Run) -> None:
     assert run("--version") == (0, f"malta {version('malta')}\n", "")
 
 
+@pytest.mark.slow
 def test_python_runs_the_package_as_the_program() -> None:
     command = [sys.executable, "-W", "error", "-m", "malta", "check", "nothing.json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
@@ -1050,6 +1071,7 @@ def test_published_figures_are_found_from_any_folder(
     assert "<=" in out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 @pytest.mark.parametrize("buffered", ["", "1"])
 def test_full_device_is_refused_in_a_sentence(buffered: str) -> None:

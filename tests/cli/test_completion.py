@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import Run
+from conftest import ROOT, Run, forget_machines
 
+import malta
 from malta.cli.options import GAINS
 
 ROBUST = ("robust", "robust_observer")
@@ -24,6 +25,16 @@ ROBUST = ("robust", "robust_observer")
         ("verify nothing.json --set l_", []),
         ("simulate design/gains/halbach.json --scenario ra", ["ramp"]),
         ("simulate --scenario ra", []),
+        ("simulate design/gains/robust.json --controller ", ["own", "c"]),
+        ("verify design/gains/robust.json --current-loops p", ["pi"]),
+        ("verify design/gains/robust.json --uncertain l_", ["l_B=", "l_S="]),
+        ("verify design/gains/robust.json --machine examples/ball/ba", ["examples/ball/ball.py"]),
+        ("export design/gains/robust.json --to f", ["fmu"]),
+        ("export design/gains/robust.json --part m", ["machine"]),
+        ("plot design/gains/robust.json ny", ["nyquist"]),
+        ("compare design/gains/table", [f"design/gains/table2{form}" for form in GAINS]),
+        ("identify design/gains/robust.json log.npz -p l_", ["l_B", "l_S"]),
+        ("campaign design/gains/robust.json --study t", ["tolerances"]),
     ],
 )  # fmt: skip
 def test_completion(typed: str, offered: list[str], monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
@@ -47,3 +58,22 @@ def test_a_folder_without_designs_offers_its_folders(
     monkeypatch.setenv("COMP_WORDS", "malta design mi")
     monkeypatch.setenv("COMP_CWORD", "2")
     assert run().out.split() == ["mine.toml", "mine/"]
+
+
+def test_scenarios_of_a_machine_of_ones_own_are_offered_where_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    """Its module runs only where the user has typed its name, or set MALTA_MACHINE."""
+    folder = ROOT / "tests" / "foreign" / "disk"
+    spec = malta.read_design(folder / "design" / "disk.toml")
+    model = malta.linearize(spec.plant, spec.plant.at())
+    law = malta.synthesize(spec, model)
+    malta.gains.write(law, malta.verify(model, law), tmp_path / "disk.json")
+    forget_machines()
+    monkeypatch.setenv("_MALTA_COMPLETE", "complete_bash")
+    for named, offered in (("", []), (f"--machine {folder / 'disk.py'} ", ["step"])):
+        words = f"malta simulate {tmp_path / 'disk.json'} {named}--scenario st"
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+        assert run().out.split() == offered
+    forget_machines()

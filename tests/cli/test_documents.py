@@ -16,7 +16,7 @@ from malta.cli.documents.published import ALL_SCHEMAS, MODELS, schema_of as sche
 from malta.report.ledger import Ledger, LedgerClaim
 from malta.units import distinct, identifier, unit_factor, unit_suffix
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 TABLE2, HALBACH = "design/gains/table2.json", "design/gains/halbach.json"
 FEW: dict[str, dict[str, Any]] = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}
@@ -44,6 +44,7 @@ def _keys(content: Any) -> list[str]:
     return [key for value in content for key in _keys(value)] if isinstance(content, list) else []
 
 
+@pytest.mark.slow_for("design")
 @pytest.mark.parametrize("name", ALL_SCHEMAS)
 def test_every_schema_is_one(name: str) -> None:
     found = schema(name)
@@ -72,6 +73,7 @@ def test_verify(run: Run, gains: str) -> None:
     assert all(disk["phase_rad"] < 3.15 for disk in found["robust"]["disks"])
 
 
+@pytest.mark.slow
 def test_verify_as_json_and_as_tables_has_the_figures_of_the_record(run: Run) -> None:
     """Figures of a shipped design; those of frequencies agree with 400 000 of them to 2e-5."""
     gains = "design/gains/halbach.json"
@@ -103,6 +105,7 @@ def test_verify_as_json_and_as_tables_has_the_figures_of_the_record(run: Run) ->
         assert text in tables
 
 
+@pytest.mark.slow
 def test_verify_of_an_unstable_loop_has_nulls(run: Run) -> None:
     said = run("verify", TABLE2, "--set", "K_A=5e4", "--no-proof", "--json")
     assert said.code == 1
@@ -111,6 +114,7 @@ def test_verify_of_an_unstable_loop_has_nulls(run: Run) -> None:
     assert found["stable"] is False
 
 
+@pytest.mark.slow
 def test_simulate(run: Run) -> None:
     found = document(run("simulate", TABLE2, "--json"), "simulate-output")
     merits = found["merits"]

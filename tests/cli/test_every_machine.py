@@ -21,6 +21,7 @@ from malta.identification.learn import own_stroke
 from malta.identification.log import log_of
 from malta.identification.log_files import read_log
 from malta.identification.prediction import current_shares
+from malta.identification.response import Flow
 from malta.identification.strokes import stroke_of
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -28,6 +29,8 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 GAINS = sorted((ROOT / "design" / "gains").glob("*.json"))
 EXAMPLES = sorted((ROOT / "examples").glob("*/design/*.toml"))
 DESIGNS = {path.stem: path for path in (*GAINS, *EXAMPLES)}
+# Without machines under a law that another has too, for what takes long: weights alone take no other way.
+KINDS = [name for name in DESIGNS if name not in ("table2", "calibrated_slow", "halbach_calm")]
 FAR = 2.0  # halves of a 95 % interval: once in ten thousand intervals by chance
 NOISY = 4.0  # standard deviations
 
@@ -121,7 +124,7 @@ def test_a_stroke_follows_the_thrust_the_samples_and_the_band(name: str, shipped
 @pytest.mark.parametrize("lag", [0.01, 1.0, 30.0])
 def test_shares_of_a_current_have_its_moments(steps: int, lag: float) -> None:
     """By quadrature: a double integrator that RK4 moves by these shares ends where the lagging current moves it."""
-    f = current_shares(lag, 1.0, steps)[:-1].reshape(steps, 3)
+    f = current_shares(Flow(lag, 0.0, 1.0), steps)[:-1].reshape(steps, 3)
     s = (np.arange(200_000) + 0.5) / 200_000
     share = (1 - np.exp(-lag * s)) / (1 - np.exp(-lag))
     speed = f @ [1 / 6, 4 / 6, 1 / 6] / steps
@@ -131,9 +134,9 @@ def test_shares_of_a_current_have_its_moments(steps: int, lag: float) -> None:
 
 
 def test_shares_go_from_held_to_even() -> None:
-    assert not current_shares(math.inf, 1.0, 2).any()
-    assert current_shares(0.0, 1.0, 1) == pytest.approx([0.0, 0.5, 1.0, 0.5])
-    assert current_shares(2e-3, 1.0, 1) == pytest.approx([0.0, 0.5, 1.0, 0.5], abs=1e-3)
+    assert not current_shares(Flow(math.inf, 0.0, 1.0), 2).any()
+    assert current_shares(Flow(0.0, 0.0, 1.0), 1) == pytest.approx([0.0, 0.5, 1.0, 0.5])
+    assert current_shares(Flow(2e-3, 0.0, 1.0), 1) == pytest.approx([0.0, 0.5, 1.0, 0.5], abs=1e-3)
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -158,7 +161,7 @@ def few_machines(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_machines")
-@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("name", KINDS)
 def test_the_bench_of_every_machine(name: str, shipped: Any, run: Run, tmp_path: Path) -> None:
     """excite, log, identify, replay and measure on their defaults: a machine is found in its own log."""
     one, log = shipped(name), tmp_path / "excited.npz"
@@ -185,7 +188,7 @@ def test_the_bench_of_every_machine(name: str, shipped: Any, run: Run, tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_machines")
-@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("name", KINDS)
 def test_the_first_day_of_every_machine(name: str, shipped: Any, run: Run, tmp_path: Path) -> None:
     """commission, then learn from its stroke: the gain file's own machine passes, with the thrust that is expected."""
     one = shipped(name)
@@ -250,7 +253,7 @@ def test_a_log_of_the_main_job_is_replayed(name: str, shipped: Any, run: Run, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("name", KINDS)
 def test_what_is_drawn_compared_and_exported_of_every_machine(
     name: str, shipped: Any, run: Run, tmp_path: Path
 ) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 
 import malta
 from malta.cli.main import Commands
-from malta.margins.loop_report import Outcome
+from malta.margins.outcome import Outcome
 from malta.report.ledger import Ledger, LedgerClaim
 from malta.report.tables import COLOURS, end_cell
 
@@ -33,10 +33,12 @@ FILES = {
     "FOLDER:RUN": "",
 }
 WORDS = {
-    *("NAME", "NAME=VALUE", "KIND", "SCENARIO", "WORD", "LIMIT", "ADDRESS", "PORT"),
+    *("NAME", "NAME=VALUE", "KIND", "SCENARIO", "WORD", "LIMIT", "ADDRESS", "PORT", "ADDRESS:PORT"),
+    *("COLUMN", "NAME=COLUMN", "SPAN"),  # of logs of other programs, and parts of logs
     *("N", "SECONDS", "QUANTITY", "SHARE", "SHARE|NAME=SHARE", "LOW..HIGH"),
 }
-SEVERAL = "--out", "--log", "--port"  # files of many kinds; a log or a time; of a serial line or of a page
+# Files of many kinds; a log or a time; of a serial line or of a page; a column of a log or what work may take.
+SEVERAL = "--out", "--log", "--port", "--time"
 COLOURED = re.compile(r"\x1b\[(?:\d+;)*3[1-7]m")
 TOLD = "malta", "verify", "design/gains/halbach.json", "--no-proof"
 

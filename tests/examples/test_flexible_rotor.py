@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -12,22 +11,18 @@ from conftest import ROOT
 
 import malta
 from malta.margins.travel import travel_loops
-from malta.model import machines
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    pass
 
 FOLDER = ROOT / "examples" / "flexible_rotor"
 
 
 @pytest.fixture(scope="module")
-def example() -> Iterator[Any]:
-    """Its modules by name; other tests do not find the machine."""
+def example() -> Any:
+    """Its modules by name."""
     rotor = malta.machine(FOLDER / "flexible_rotor.py")
-    yield lambda part: rotor if part == "flexible_rotor" else import_module(f"{rotor.__name__}.{part}")
-    del machines._files["flexible_rotor"]
-    for name in [name for name in sys.modules if name.startswith(f"{machines.FILES}.flexible_rotor")]:
-        del sys.modules[name]
+    return lambda part: rotor if part == "flexible_rotor" else import_module(f"{rotor.__name__}.{part}")
 
 
 @pytest.fixture(scope="module")

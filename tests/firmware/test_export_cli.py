@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from malta.firmware.program import Precision
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 GAINS = "design/gains/halbach.json"
 
@@ -45,6 +45,7 @@ def build_and_test(folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow_for("double")
 @pytest.mark.parametrize("precision", ["double", pytest.param("float", marks=pytest.mark.slow)])
 def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, precision: str) -> None:
     folder = tmp_path / "c"
@@ -68,6 +69,7 @@ def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, prec
     assert "| nan" not in report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("part", "fmi"), [("controller", "2"), ("loop", "3")])
 def test_export_writes_an_fmu(run: Run, tmp_path: Path, part: str, fmi: str) -> None:
     if compiled.compiler() is None:
@@ -104,6 +106,7 @@ def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
         (("--to", "c", "--part", "loop"), "--part: found loop of a folder of C, expected --to fmu"),
         (("--to", "fmu", "--fmi", "1"), "--fmi: found 1, expected 2 or 3"),
         (("--to", "fmu", "--precision", "float"), "--precision: found float of an FMU, expected double"),
+        (("--to", "fmu", "--fma"), "--fma: found an FMU, expected --to c"),
         (("--until", "volts"), "--until: found 'volts', expected currents or duty-cycles"),
         (("--out", "/dev/null"), "/dev/null: found a file of that name, expected a folder, new or empty"),
         (("--out", "/proc/no"), "expected a place to write the file to"),
@@ -264,6 +267,7 @@ def test_a_design_of_each_kind_exports(name: str, precision: Precision, tmp_path
     assert ("% is proven" in report) == single
 
 
+@pytest.mark.slow
 def test_the_report_counts_by_the_clock_of_the_processor(tmp_path: Path, run: Run) -> None:
     """The share of a sample is that of instructions over the clock: a tenth of the clock, ten times the share."""
     found = []

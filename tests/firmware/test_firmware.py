@@ -34,6 +34,7 @@ def _with_compiler() -> None:
         pytest.skip("no C compiler")
 
 
+@pytest.mark.slow_for("robust-double")
 @pytest.mark.parametrize(("name", "precision"), of_each_kind("robust", "halbach_late"))
 def test_every_piece_computes_the_bits_of_its_expressions(name: str, precision: Precision) -> None:
     t = target(name, precision)
@@ -74,6 +75,7 @@ def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Preci
         assert bool(sensed["refused"].any()) == (k == 5)
 
 
+@pytest.mark.slow_for("tubular_pid")
 @pytest.mark.parametrize("name", ["table2", "tubular_pid"])
 def test_the_pieces_make_the_step(name: str) -> None:
     """Called one after the other as a firmware may do, in double precision: the bits of a step."""
@@ -113,6 +115,7 @@ def test_the_pieces_make_the_step(name: str) -> None:
             assert np.array_equal(mine, theirs), k
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
 def test_it_flies_to_the_bit_where_nothing_is_contracted(fidelity: Any) -> None:
     """A noisy stroke: CasADi's virtual machine and the C compute the same numbers, in double precision."""
@@ -175,6 +178,7 @@ def test_a_table_of_currents_is_exported(tmp_path: Path) -> None:
         build_fmu(t, "0" * 64, part="loop")
 
 
+@pytest.mark.slow_for("robust-double", "robust-float", "halbach-float")
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", ["robust", "halbach", pytest.param("planar_pid", marks=pytest.mark.slow)])
 def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> None:

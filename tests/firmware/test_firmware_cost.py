@@ -44,6 +44,7 @@ def test_a_step_takes_a_tenth_of_the_period(precision: Precision) -> None:
     assert 0.05 < count / (t.controller.sample_time * CLOCK) < 0.10
 
 
+@pytest.mark.slow_for("halbach")
 @pytest.mark.parametrize("name", ["halbach", pytest.param("robust", marks=pytest.mark.slow)])
 def test_casadi_generates_the_same_step(name: str, tmp_path: Path) -> None:
     """CasADi's C of the expressions before they are lowered, over the recorded vectors: within 1e-12 of each range."""

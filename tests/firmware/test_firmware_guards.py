@@ -65,6 +65,7 @@ def write_files(files: dict[str, str], folder: Path) -> list[Path]:
     return sorted(path for path in paths if path.suffix == ".c")
 
 
+@pytest.mark.slow_for("halbach-float")
 @pytest.mark.parametrize(
     ("name", "precision"),
     [
@@ -114,6 +115,25 @@ def test_no_file_has_a_fused_instruction(name: str, precision: Precision, cc: st
     assert bare > 50
 
 
+@pytest.mark.slow_for(
+    "-std=c99 -O0-1 1 1 5 1-double",
+    "-std=c99 -O2-1 1 1 5 1-double",
+    "-std=c99 -O2-1 1 1 5 1-float",
+    "-std=c99 -O3-1 1 1 5 1-double",
+    "-std=c99 -O3-1 1 1 5 1-float",
+    "-O2 -ffp-contract=fast -mfma-1 1 1 5 1-double",
+    "-O2 -ffp-contract=fast -mfma-1 1 1 5 1-float",
+    "-O2 -frounding-math -fno-trapping-math-1 1 1 5 1-double",
+    "-O2 -frounding-math -fno-trapping-math-1 1 1 5 1-float",
+    "-O2 -funsafe-math-optimizations-0 0 0 0 0-double",
+    "-O2 -funsafe-math-optimizations-0 0 0 0 0-float",
+    "-O2 -fassociative-math -fno-signed-zeros -fno-trapping-math-0 0 0 0 0-double",
+    "-O2 -fassociative-math -fno-signed-zeros -fno-trapping-math-0 0 0 0 0-float",
+    "-O2 -freciprocal-math-0 0 0 0 0-double",
+    "-O2 -freciprocal-math-0 0 0 0 0-float",
+    "-O2 -fno-signed-zeros-0 0 0 0 0-double",
+    "-O2 -fno-signed-zeros-0 0 0 0 0-float",
+)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize(
     ("flags", "found"),
@@ -142,6 +162,7 @@ def test_a_machine_stays_off_where_the_arithmetic_is_another(
     assert found in started(tmp_path, precision, "gcc", *flags.split())
 
 
+@pytest.mark.slow
 def test_the_test_says_why(tmp_path: Path) -> None:
     """Where vectors differ, or would, for the options of the compiler."""
     done = run_test(HERE, write_folder("halbach", "double", tmp_path), "-O2", "-funsafe-math-optimizations")
@@ -157,6 +178,7 @@ def test_clang_is_told_or_found_out(flags: str, precision: Precision, tmp_path: 
     assert found in ({FIT} if flags == "-O2" else {UNFIT} if "unsafe" in flags else {FIT, UNFIT})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of", ["", "_parts", "_supervisor"])
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_each_file_is_tried_by_itself(of: str, precision: Precision, tmp_path: Path) -> None:

@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 from exported import PRECISIONS, require, root_text, run, target, texts, write_folder
 
+from malta.firmware import export
 from malta.firmware.export import DEVIATIONS
 from malta.firmware.program import Precision
 from malta.firmware.sources import ring_sources, sources
+from malta.firmware.xcp import XcpPort
+
+pytestmark = pytest.mark.first
 
 CHECKS = ("--addon=misra", "--enable=warning,style,performance,portability", "--std=c99", "--quiet")
 SECONDS = 600.0  # for a file, on a computer with much else to do
@@ -45,6 +49,7 @@ def test_designs_of_each_kind_deviate_from_nothing_else(name: str, tmp_path: Pat
             assert rule in of, f"{file} deviates from {rule}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_roots_deviate_from_nothing(precision: Precision, tmp_path: Path) -> None:
     """The small folder of the other test has none."""
@@ -62,6 +67,22 @@ def test_rings_deviate_from_nothing(name: str, tmp_path: Path) -> None:
     for file, text in (sources(t, "0" * 64, name) | ring_sources(t, "0" * 64, name)).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     assert {rule for _, rule in deviations(tmp_path / f"{name}_log.c", GCC)} == {"2.5"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["robust", "halbach"])
+def test_wirings_and_slaves_deviate_from_nothing_else(name: str, tmp_path: Path) -> None:
+    """What tries the wiring, commits parameters and answers a calibration tool."""
+    require("cppcheck")
+    t = replace(target(name, "float"), tunable=True, xcp=XcpPort(), wiring=name == "robust")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "costs", lambda _: [])
+        for file, text in export.folder_files(t, "0" * 64, proof=False).items():
+            (tmp_path / file).write_text(text, encoding="utf-8")
+    for end in ("_supervisor.c", "_parameters.c", "_xcp.c"):
+        for file, rule in deviations(tmp_path / f"{name}{end}", GCC):
+            of = {d.rule for d in DEVIATIONS if file.endswith(d.files)}
+            assert rule in of, f"{file} deviates from {rule}"
 
 
 def deviations(path: Path, *options: str) -> list[tuple[str, str]]:

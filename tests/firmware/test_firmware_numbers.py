@@ -122,6 +122,7 @@ def test_two_seconds_of_single_precision() -> None:
     assert tenths[-1] < 2 * tenths[0]
 
 
+@pytest.mark.slow_for("robust-float", "tubular_pid-double", "tubular_pid-float")
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", ["halbach", "robust", "tubular_pid"])
 @settings(max_examples=40, deadline=None)
@@ -216,6 +217,7 @@ def test_a_motor_turns_on_beyond_one_radian() -> None:
     np.testing.assert_allclose(flown.p, own.p, rtol=1e-12)
 
 
+@pytest.mark.slow_for("1e+38-True")
 @pytest.mark.parametrize(("gain", "fits"), [(1e38, True), (1e39, False)])
 def test_single_precision_refuses_what_it_does_not_hold(gain: float, fits: bool) -> None:
     c = controller("tubular_pid")
@@ -227,6 +229,7 @@ def test_single_precision_refuses_what_it_does_not_hold(gain: float, fits: bool)
             sources(t, "")
 
 
+@pytest.mark.slow
 def test_the_samples_of_a_stroke_are_counted_at_any_rate() -> None:
     """At 1 MHz the longest rise is shorter than a thousand seconds: 2^31 half samples are all."""
     c = controller("tubular_pid")

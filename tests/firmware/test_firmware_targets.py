@@ -46,6 +46,7 @@ def test_every_processor_computes_the_same_bits(name: str, precision: Precision,
         assert checksum(run_test(processor, folder, "-O2").stdout) == expected, processor
 
 
+@pytest.mark.slow_for("float--O0", "float--O1", "float--Os")
 @pytest.mark.parametrize("level", ["-O0", "-O1", "-Os", pytest.param("-O3", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("precision", SOME)
 def test_optimization_changes_no_bit(level: str, precision: Precision, tmp_path: Path) -> None:
@@ -68,15 +69,16 @@ def test_contraction_is_noticed(precision: Precision, tmp_path: Path) -> None:
     assert re.match(DIFFERS, done.stdout)
 
 
+@pytest.mark.slow
 def test_a_changed_vector_is_named(tmp_path: Path) -> None:
     """A reading of the first vector's fifth sample, a little larger: the test names vector, sample and signal."""
     folder = write_folder("halbach", "double", tmp_path)
     path = folder / "halbach_test.c"
     lines = path.read_text(encoding="utf-8").splitlines()
-    first = next(k for k, line in enumerate(lines) if '"stroke"' in line) + 1
-    row = lines[first + 4].split(", ")
+    first = next(k for k, line in enumerate(lines) if '{ "stroke"' in line) + 1
+    row = lines[first + 4].strip("{},").split(", ")
     row[3] = repr(float(row[3]) + 1e-9)
-    lines[first + 4] = ", ".join(row)
+    lines[first + 4] = "{" + ", ".join(row) + "},"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     done = run_test(HERE, folder)
     assert done.returncode == 1

@@ -12,6 +12,8 @@ from malta.firmware.program import Precision
 from malta.firmware.supervisor import IN_USE, MONITORS, TRANSITIONS, absent_monitors, monitors_of
 from malta.firmware.vectors import out_of_reach, watch_table
 
+pytestmark = pytest.mark.first
+
 LINES = 95.0  # % of each file that a run executes
 
 
@@ -64,6 +66,7 @@ WRONG = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new"), [w[1:] for w in WRONG], ids=[w[0] for w in WRONG])
 def test_it_finds_what_is_wrong(old: str, new: str, tmp_path: Path) -> None:
     folder = write_folder("halbach", "double", tmp_path)
@@ -76,6 +79,7 @@ def test_it_finds_what_is_wrong(old: str, new: str, tmp_path: Path) -> None:
     assert done.stdout.startswith("supervisor: ")
 
 
+@pytest.mark.slow
 def test_a_piece_that_computes_something_else_is_named(tmp_path: Path) -> None:
     folder = write_folder("halbach", "double", tmp_path)
     path = folder / "halbach_parts.c"

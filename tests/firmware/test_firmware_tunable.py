@@ -44,6 +44,7 @@ def tunable(name: str, precision: Precision = "double") -> Target:
     return replace(target(name, precision), tunable=True)
 
 
+@pytest.mark.slow_for("halbach-float")
 @pytest.mark.parametrize(
     ("name", "precision"),
     [
@@ -313,3 +314,87 @@ def test_the_command_writes_the_files(tmp_path: Path) -> None:
     files = malta.export_c(gains, tmp_path / "c", proof=False, tunable=True)
     names = {file.name for file in files}
     assert {"halbach.a2l", "halbach_parameters.c"} <= names
+
+
+@cache
+def supervised() -> Any:
+    if compiler() is None:
+        pytest.skip("no C compiler")
+    return compile_supervised(tunable("halbach"))
+
+
+def calibration(native: Native) -> Any:
+    kind = type(record(native))
+    ints = [(name, ctypes.c_int32) for name in ("ready", "used", "reason", "entry", "commits")]
+    page: Any = type(
+        "Calibration", (ctypes.Structure,), {"_fields_": [("working", kind), ("pages", kind * 2), *ints]}
+    )
+    return page()
+
+
+def test_a_commit_is_checked_beside_the_law_and_taken_by_a_sample() -> None:
+    """Three records: what a tool writes is never what a step reads; what is refused changes nothing."""
+    s = supervised()
+    lib, own = s.native.lib, calibration(s.native)
+    name = s.native.name
+    state, supervisor, request = begun(s.native), s.Supervisor(), s.Request()
+    inputs, outputs = s.native.Inputs(), s.native.Outputs()
+    getattr(lib, f"{name}_supervisor_init")(ctypes.byref(supervisor))
+    getattr(lib, f"{name}_calibration_init")(ctypes.byref(own))
+    supervisor.calibration = ctypes.addressof(own)
+
+    def commit(p: Any) -> int:
+        return int(getattr(lib, f"{name}_calibration_commit")(ctypes.byref(own), p and ctypes.byref(p)))
+
+    def step() -> None:
+        getattr(lib, f"{name}_supervisor_step")(
+            *(ctypes.byref(r) for r in (supervisor, state, inputs, request, outputs))
+        )
+
+    before = state.parameters
+    own.working.force_limit[0] *= 0.5
+    assert (commit(own.working), own.commits, state.parameters) == (0, 0, before)
+    assert commit(own.working) == 5  # the one before waits
+    step()
+    assert (own.commits, own.used) == (1, 1)
+    assert state.parameters == ctypes.addressof(own) + type(own).pages.offset + ctypes.sizeof(
+        type(own.working)
+    )
+    taken = state.parameters
+    for wrong in (0.0, np.nan, 1e30):
+        own.working.K[1] = wrong
+        assert (commit(own.working), own.entry) == (3, 1)
+        step()
+        assert (own.commits, state.parameters) == (1, taken)
+    assert commit(None) == 0  # that of the gain file
+    step()
+    assert own.commits == 2
+
+
+def test_a_start_that_is_refused_says_why() -> None:
+    s = supervised()
+    lib, name = s.native.lib, s.native.name
+    p = copy(s.native)
+    state, supervisor, request = begun(s.native), s.Supervisor(), s.Request()
+    inputs, outputs = s.native.Inputs(), s.native.Outputs()
+    getattr(lib, f"{name}_supervisor_init")(ctypes.byref(supervisor))
+    assert getattr(lib, f"{name}_set_parameters")(ctypes.byref(state), None) == 0
+    assert getattr(lib, f"{name}_set_parameters")(ctypes.byref(state), ctypes.byref(p)) == 1
+
+    def start() -> tuple[int, int, int]:
+        for asked in (0, 1):
+            request.start = asked
+            getattr(lib, f"{name}_supervisor_step")(
+                *(ctypes.byref(r) for r in (supervisor, state, inputs, request, outputs))
+            )
+        return supervisor.refused, supervisor.refused_entry, supervisor.state
+
+    p.K[0] *= 3.0  # in use, as a tool would that knows no better
+    assert start() == (3, 0, NUMBERS["OFF"])
+    p.K[0] = record(s.native).K[0] * (1 + 1e-3)
+    assert start() == (2, -1, NUMBERS["OFF"])
+    request.sto = 1
+    assert start() == (11, -1, NUMBERS["OFF"])
+    request.sto = 0
+    seal(s.native, p)
+    assert start() == (0, -1, NUMBERS["OFFSETS"])

@@ -75,6 +75,7 @@ def wave(unit: Unit, k: int) -> Mapping[str, Any]:
     }
 
 
+@pytest.mark.slow_for("controller")
 @pytest.mark.parametrize("part", [*PARTS[:1], *(pytest.param(p, marks=pytest.mark.slow) for p in PARTS[1:])])
 def test_each_part_is_stepped_to_the_same_bits(
     part: Part, unpack: Callable[[str, Part], Unit], tmp_path: Path

@@ -82,6 +82,7 @@ def test_a_supervised_step_takes_longer_than_the_controllers(p: object, tmp_path
     assert 2 * step < cost.supervised < 15 * step
 
 
+@pytest.mark.slow
 def test_the_report_says_how_it_is_counted() -> None:
     report = folder_files(target("halbach", "float"), "0" * 64, proof=False)["REPORT.md"]
     assert "It is counted on its longest path: every" in report

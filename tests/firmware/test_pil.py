@@ -109,6 +109,7 @@ def target(tmp_path: Path, wire: Callable[[list[str]], str]) -> str:
     return wire([str(build(HERE, write_target(tmp_path), "-O1", main="_pil"))])
 
 
+@pytest.mark.slow_for("double")
 @pytest.mark.parametrize("precision", ["double", pytest.param("float", marks=pytest.mark.slow)])
 def test_a_target_with_the_same_bits_passes(
     precision: Precision, tmp_path: Path, wire: Callable[[list[str]], str], run: Run
@@ -128,6 +129,7 @@ def test_a_target_with_the_same_bits_passes(
     assert (found["requests_sent_again"], found["slowest_step_counts"]) == (0, None)
 
 
+@pytest.mark.slow
 def test_another_bit_is_found(tmp_path: Path, wire: Callable[[list[str]], str], run: Run) -> None:
     """A force that is larger by its last bit, from the third step of all on."""
     line = "  run->counts = halbach_pil_count() - run->counts;\n"
@@ -145,6 +147,7 @@ def test_another_bit_is_found(tmp_path: Path, wire: Callable[[list[str]], str], 
     assert out.endswith("fail: the target computes other bits\n")
 
 
+@pytest.mark.slow
 def test_another_gain_file_is_a_sentence(tmp_path: Path, wire: Callable[[list[str]], str], run: Run) -> None:
     for file, text in texts("halbach", "double").items():
         (tmp_path / file).write_text(text, encoding="utf-8")

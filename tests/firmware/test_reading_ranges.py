@@ -75,8 +75,10 @@ def test_positions_of_a_machine_without_contacts_are_unlimited() -> None:
     [
         ((1.0,), "1 entries"),
         ((0.0, -1.0), "-1.0"),
+        ((0.0, None), "None"),
         ((0.0, (3.0, -3.0)), r"\(3.0, -3.0\)"),
         ((0.0, np.nan), "nan"),
+        ((1e-9, 7.0), "1 nm, which its noise of "),
     ],
 )
 def test_a_range_that_is_no_size_is_refused(ranges: tuple[Any, ...], found: str) -> None:

@@ -115,9 +115,10 @@ class Bench:
                 view(self.inputs, "i")[:] = given.get("i", self.currents(place))
                 view(self.inputs, "i_valid")[:] = given.get("i_valid", 1)
                 view(self.inputs, "link")[:] = given.get("link", 45.0)
-            for field, value in self.forced.items():
-                if value is not None:
-                    view(self.inputs, field)[0] = value
+            for field, forced in self.forced.items():
+                if forced is not None:
+                    values = view(self.inputs, field)
+                    values[forced[0] % len(values)] = forced[1]
             for name in ("start", "operate", "land", "acknowledge", "missed", "stop", "sto"):
                 setattr(self.request, name, given.get(name, 0))
             view(self.request.reference, "p")[0] = given.get("reference", 0.0)
@@ -158,6 +159,7 @@ class Bench:
         return MONITORS[self.supervisor.monitor] if self.supervisor.monitor >= 0 else ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robust", "halbach", "tubular_pid"])
 def test_states_follow_each_other_without_jumps(name: str) -> None:
     """From off to operation, through a landing to off: the reference is smooth and starts where the machine rests."""
@@ -218,6 +220,7 @@ def test_a_reading_that_cannot_be_true_is_left_out_and_believed_again() -> None:
         assert np.isfinite(view(bench.outputs, "command")).all()
 
 
+@pytest.mark.slow
 def test_a_sensor_that_stays_away_stops_the_stroke_and_lands() -> None:
     bench = Bench().fly()
     bench.step(300)
@@ -253,6 +256,7 @@ def test_a_landing_goes_on_where_no_sensor_is_believed_for_a_sample() -> None:
     assert bench.step(20) == "LANDING"
 
 
+@pytest.mark.slow
 def test_a_reference_reaches_its_place_before_operation_goes_on() -> None:
     """One that moves would fade to its request beyond the end of the travel."""
     bench = Bench().fly()
@@ -294,7 +298,7 @@ ACTS: tuple[Acts, ...] = (
     ("a sagging link", {"link": 30.0}, 3, "LINK", "HOLD"),
     ("a link without a reading", {"link": math.nan}, 3, "LINK", "HOLD"),
     ("a link that stays down", {"link": 4.5}, 2000, "LINK", "LANDING"),
-    ("a current beyond its limits", {"i": 11.0}, 3, "CURRENT", "FAULT"),
+    ("a current beyond its limits", {"i": np.tile([11.0, -5.5, -5.5], 6)}, 3, "CURRENT", "FAULT"),
     ("a link with too much voltage", {"link": 55.0}, 3, "OVERVOLTAGE", "FAULT"),
     ("currents without a reading", {"i": math.nan}, 5, "CURRENT_LOST", "FAULT"),
     ("currents that are called invalid", {"i_valid": 0.0}, 5, "CURRENT_LOST", "FAULT"),
@@ -306,6 +310,7 @@ ACTS: tuple[Acts, ...] = (
 )
 
 
+@pytest.mark.slow_for("a link that stays down")
 @pytest.mark.parametrize(
     ("given", "samples", "monitor", "state"), [a[1:] for a in ACTS], ids=[a[0] for a in ACTS]
 )
@@ -351,12 +356,26 @@ def test_a_machine_that_does_not_answer_its_forces_is_held_and_landed() -> None:
 def test_a_filter_that_expects_other_readings_stops_the_stroke() -> None:
     bench = Bench().fly()
     bench.step(300)
-    for samples, state in ((19, "OPERATE"), (1, "HOLD"), (379, "HOLD"), (1, "LANDING")):
-        for _ in range(samples):
-            view(bench.state, "xi_pred")[:] = np.eye(15)[1] * 20e-6
-            bench.step()
-        assert bench.now == state
-    assert acted(bench, "INNOVATION") == [2, 2]  # both sensors of y
+    lasted = {"OPERATE": 0, "HOLD": 0}
+    while bench.now in lasted:
+        lasted[bench.now] += 1
+        off = min(0.4e-6 * sum(lasted.values()), 20e-6)  # at once it would be a filter that is lost
+        view(bench.state, "xi_pred")[:] = np.eye(15)[1] * off
+        bench.step()
+    assert 20 + 6 < lasted["OPERATE"] < 20 + 16  # over 8 deviations from the 11th sample on, with noise
+    assert lasted["HOLD"] == 380
+    assert bench.now == "LANDING"
+    assert acted(bench, "INNOVATION")[0] == 2  # both sensors of y
+
+
+def test_a_filter_that_is_off_its_readings_at_once_switches_off() -> None:
+    """No reading leapt, and which one is right nothing tells: a fall is softer than what the law would do."""
+    bench = Bench().fly()
+    bench.step(300)
+    for _ in range(8):
+        view(bench.state, "xi_pred")[:] = np.eye(15)[1] * 20e-6
+        bench.step()
+    assert (bench.now, bench.monitor) == ("FAULT", "ASTRAY")
 
 
 def test_a_filter_that_lost_its_way_switches_off() -> None:
@@ -372,6 +391,7 @@ def test_a_filter_that_lost_its_way_switches_off() -> None:
     assert (bench.now, bench.monitor) == ("FAULT", "HELPLESS")
 
 
+@pytest.mark.slow
 def test_near_its_bearing_it_lands() -> None:
     bench, bound = Bench().fly(), bounds_of(STUCK).touch
     assert bound[:4] == pytest.approx(0.7 * 0.6e-3, rel=1e-6)
@@ -400,6 +420,7 @@ def test_it_starts_neither_with_offsets_nor_with_dead_sensors() -> None:
     assert (bench.now, bench.monitor) == ("FAULT", "UNREADY")
 
 
+@pytest.mark.slow
 def test_a_machine_that_does_not_settle_lands() -> None:
     bench = Bench()
     while bench.step(start=1, operate=1) != "SETTLE":
@@ -483,6 +504,7 @@ def test_one_sensor_less_leaves_a_stable_filter() -> None:
     assert monitors["UNBELIEVED"] == "FAULT"
 
 
+@pytest.mark.slow
 def test_a_filter_without_a_sensor_keeps_what_it_knows_of_disturbances() -> None:
     """One radial sensor of a plane cannot see two forces: their estimates stay, the rest of the filter is stable."""
     t = Target(malta.gains.read(ROOT / "design" / "gains" / "robust_observer.json"))
@@ -522,6 +544,7 @@ def test_one_sensor_less_where_the_model_has_a_delay(delay: int) -> None:
         assert sorted(gains_without(Target(c, fidelity="force")).L) == [0, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "precision"), [("robust", "float"), ("halbach", "double")])
 def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> None:
     t, cc = target(name, precision), compiler()
@@ -606,6 +629,7 @@ def declared(folder: Path, text: str = DECLARED) -> malta.Spec:
     return malta.read_design(path)
 
 
+@pytest.mark.slow
 def test_limits_of_references_are_declared_in_the_design_file(tmp_path: Path) -> None:
     """They go with the gains in every form, and change no gain."""
     spec = declared(tmp_path)
@@ -647,6 +671,7 @@ def test_limits_of_references_beyond_the_machine_are_refused(tmp_path: Path) -> 
         reference_limits(Target(c))
 
 
+@pytest.mark.slow
 def test_a_step_of_the_reference_is_refused_and_then_faded_to_within_the_limits() -> None:
     """10 mm in one sample: the reference stops, and goes there when the request stays, no faster than the forces do."""
     bench = Bench().fly()
@@ -685,6 +710,7 @@ def test_operation_does_not_begin_with_a_bad_request(bad: float) -> None:
 REALS_OF_SUPERVISOR = [m.name for m in supervisor_members(STUCK) if m.kind == "real" and m.size]
 
 
+@pytest.mark.slow
 def test_no_number_of_the_supervisor_is_ever_anything_else() -> None:
     """Any numbers in readings, validity, currents, link and requests, in all states."""
     rng = np.random.default_rng(3)
@@ -694,7 +720,7 @@ def test_no_number_of_the_supervisor_is_ever_anything_else() -> None:
         often = rng.random() < 0.98
         for field in ("y", "i", "link"):
             pick = rng.choice(wild)
-            bench.forced[field] = None if often else pick
+            bench.forced[field] = None if often else (int(rng.integers(18)), pick)
         reference = 0.0 if often else float(rng.choice(wild))
         flags: dict[str, Any] = {
             name: int(rng.random() < 0.3) for name in ("start", "operate", "acknowledge")
@@ -780,6 +806,7 @@ def test_a_current_below_its_command_lands_and_one_beyond_it_is_off(
     assert samples >= least
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sticks_in_a_lift_is_found_while_the_reference_goes_16_deviations() -> None:
     """And none is ignored in a lift and a landing without a fault."""
     bench = Bench()
@@ -897,7 +924,7 @@ def test_it_prevents_touchdowns(during: str, counts: tuple[int, int, int]) -> No
     speeds = {case.label: case.merits[2].value for case in e.cases}
     assert speeds["y1 stuck"] > 0.1
     assert speeds["y1 stuck (s)"] < MAX_LANDING_SPEED
-    assert speeds["y1 biased by 50 um (s)"] < 0.005
+    assert speeds["y1 biased by 50 um (s)"] < 0.01
     assert math.isnan(speeds["DC link sags by 90 % for 50 ms (s)"])
     assert not e.failed
 
@@ -911,6 +938,7 @@ def test_faults_are_chosen_by_a_word_and_fly_with_their_own_engine() -> None:
         malta.experiment("supervised-faults", malta.plant_of(c.parameters), c, only="lunch")
 
 
+@pytest.mark.slow
 def test_a_cushioned_clearance_is_used_up_at_a_share_of_it() -> None:
     """Contact is linear in a reading: radial ones are at TOUCH of where they would be without a touchdown bearing."""
     plant = malta.plant_of(TARGETS["robust"].controller.parameters)

@@ -242,6 +242,7 @@ def build_relation(name: str, folder: Path) -> Path:
     return folder / "relation"
 
 
+@pytest.mark.slow_for("halbach")
 @pytest.mark.parametrize(
     "name", ["halbach", *(pytest.param(n, marks=pytest.mark.slow) for n in ("robust", "tubular_pid"))]
 )
@@ -253,6 +254,7 @@ def test_no_step_leaves_the_relation(name: str, tmp_path: Path) -> None:
     assert int(done.stdout.split()[-1]) > 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -273,6 +275,7 @@ def test_it_finds_a_wrong_relation(old: str, new: str, tmp_path: Path) -> None:
     assert run([str(build_relation("halbach", folder))], folder).returncode == 1
 
 
+@pytest.mark.slow
 def test_stops_are_heard_at_once_in_every_state_in_which_gates_may_be_on() -> None:
     for name in ("halbach", "robust"):
         for key in ("STOP", "STO"):

@@ -50,6 +50,7 @@ def passes(t: Target, folder: Path) -> None:
     assert "pass: " in done.stdout
 
 
+@pytest.mark.slow_for("one axis-double", "one axis, PID-float")
 @pytest.mark.parametrize(
     ("name", "precision"),
     [

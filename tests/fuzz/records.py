@@ -28,14 +28,14 @@ from malta.gains.certified import check
 from malta.identification.calibration import Interval95
 from malta.identification.commission import Commissioning, JournalEntry, StepFinding, read_journal
 from malta.linear.uncertain import Compensator
-from malta.machines.tubular.experiments.strokes import forces_of, record
 from malta.proof import certificate
 from malta.report import campaign_tables
-from malta.report.page.document import binder_page, binder_text
+from malta.report.page.binder import binder_page, binder_text
 from malta.report.page.motion import motion_page, read_motion
 from malta.report.tables.experiments import findings_table
 from malta.simulation.trajectory_file import save as save_run
 from malta.tuning.search import Journal
+from malta_papers.tubular.recording import forces_of, record
 
 RARE, BOUND = "deviation-y1", 1.1e-6  # m, which few runs exceed
 PATIENCE = 3.0  # s for the check of a certificate
@@ -224,6 +224,24 @@ def read_log_file(case: Case, folder: Path) -> Ended | None:
     ended = observe(recorded, folder, [str(path)]) if shown.code == 0 else shown
     if ended.code == 0 and not np.isfinite(ended.value.v0).all():
         raise Defect(f"v0 was recorded as {ended.value.v0}")
+    return ended
+
+
+def read_response_file(case: Case, folder: Path) -> Ended | None:
+    """Read a response of an analyser; what is read is finite, at rising frequencies."""
+    f = np.geomspace(1, 100, 8)
+    rows = np.column_stack([f, *((1 / (1 + 1j * f)).real, (1 / (1 + 1j * f)).imag)])
+    tree: Any = {"headings": ["frequency [Hz]", f"{case.base} re", f"{case.base} im"], "rows": rows.tolist()}
+    path = folder / "mine.csv"
+    try:
+        path.write_bytes(_csv(edited(tree, case.edits), case))
+    except Exception:  # an edit that leaves no table
+        return None
+    ended = observe(lambda: malta.identification.read_response(path), folder, [str(path)])
+    if ended.code == 0:
+        found = ended.value
+        if not (np.isfinite(found.values).all() and (np.diff(found.w, prepend=0.0) > 0).all()):
+            raise Defect(f"a response was read as {found.w} {found.values}")
     return ended
 
 

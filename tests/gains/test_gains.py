@@ -742,6 +742,7 @@ def test_damaged_mat_does_not_reach_its_reader(tmp_path: Path, monkeypatch: pyte
     assert read == []
 
 
+@pytest.mark.slow
 def test_mat_that_crashes_its_reader_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "gains.mat"
     content = bytearray((COMMITTED / "table2.mat").read_bytes())

@@ -306,6 +306,7 @@ def test_structs_may_be_as_deep_as_the_limit() -> None:
     assert "a" in read_mat(_deep(MAX_STRUCT_DEPTH - 2))["x"]
 
 
+@pytest.mark.slow
 def test_compressed_data_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one element and of all: what is beyond is not unpacked, and no memory is taken for it."""
     monkeypatch.setattr(mat, "MAX_DECOMPRESSED_BYTES", 4000)

@@ -31,7 +31,8 @@ from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.machines.tubular import bench as tubular
 from malta.model.equilibrium import trim
 from malta.model.places import outputs_at
-from malta.report.page.document import binder_page, binder_text
+from malta.report.page.binder import binder_page, binder_text, step_pictures
+from malta.report.page.sections import Illustration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,6 +72,7 @@ def a_log(t: Any, **columns: tuple[list[str], Any]) -> malta.identification.Log:
     )
 
 
+@pytest.mark.slow
 def test_a_ring_tells_gains_cross_talk_and_offsets() -> None:
     """Intervals of five figures over 30 runs: 150 of them, of which 95 % hold the truth."""
     E, offset, r, inside = np.array([[1.03, 0.01], [0.01, 0.98]]), np.array([4e-6, -7e-6]), 0.6e-3, 0
@@ -87,6 +89,7 @@ def test_a_ring_tells_gains_cross_talk_and_offsets() -> None:
         calibration.ring(a_log(t[:200], y=(["a", "b"], y[:200])), ("a", "b"), r)
 
 
+@pytest.mark.slow
 def test_quadrature_needs_a_period_and_finds_its_errors() -> None:
     inside, phase = 0, np.linspace(0, 6.5, 1500)
     for seed in range(30):
@@ -124,6 +127,7 @@ def test_polarity_is_the_sign_of_a_slope() -> None:
         calibration.slope(a_log(t, y=(["a"], y), v=(["f"], u * (t > 1)[:, None])), ("v", "f"), "a")
 
 
+@pytest.mark.slow
 def test_the_ring_of_the_machine_reads_its_sensors() -> None:
     found = found_in("ring")
     for name, truth in (
@@ -156,14 +160,17 @@ def test_polarity_centre_cogging_and_fall_of_the_machine() -> None:
 
 
 def made_steps(limit: float, flown: list[str]) -> tuple[Check, ...]:
-    """Two steps that record without a machine, and note that they did; the second has a limit."""
+    """Two steps that record without a machine, and note that they did; the second has a limit.
+
+    A limit may be a whole number: the journal that keeps it stays the one that was signed.
+    """
 
     def record(name: str, _: Bench) -> malta.identification.Log:
         flown.append(name)
         return a_log(1e-3 * np.arange(400), y=(["a"], np.random.default_rng(0).normal(0, 1, (400, 1))))
 
     def judge(high: float, _: Any, log: malta.identification.Log) -> Sequence[StepFinding]:
-        return [StepFinding("noise", calibration.at_rest(log)["a"][1], 0.0, high)]
+        return [StepFinding("noise", calibration.at_rest(log)["a"][1], 0, high)]
 
     from functools import partial
 
@@ -218,6 +225,41 @@ def test_logs_of_a_bench_are_judged_and_waited_for(tmp_path: Path) -> None:
     assert done.signature in page
 
 
+def test_the_binder_shows_what_was_logged(tmp_path: Path) -> None:
+    """Signals of one unit share a panel; a log that is gone has no picture."""
+    done = commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(2.0, []))
+    (tmp_path / "two.npz").unlink()
+    pictures = step_pictures(done, CONTROLLER, {})
+    assert [*pictures] == ["one"]
+    (picture,) = pictures["one"]
+    assert isinstance(picture, Illustration)
+    (axes,) = picture.draw().axes
+    low, high = axes.get_ylim()
+    assert low < -2 < 2 < high < 6  # of 400 readings, sigma 1 m
+    assert binder_page(done, pictures).html.count("<figure>") == 1
+
+
+def test_a_missing_log_is_left_out_or_its_step_gone_alone(tmp_path: Path) -> None:
+    """What the journal has of other steps stays; a name that no step has is refused with those that there are."""
+    steps, day = made_steps(2.0, []), tmp_path / "day"
+    malta.identification.write_log(steps[1].record(bench()), tmp_path / "two.csv")
+    done = commission(ROBUST, CONTROLLER, day, steps=steps, logs=tmp_path, skip=["one"])
+    assert ([entry.name for entry in done.entries], done.left) == (["two"], ("one",))
+    assert done.failed is None
+    assert not done.passed
+    malta.identification.write_log(steps[0].record(bench()), tmp_path / "one.csv")
+    done = commission(ROBUST, CONTROLLER, day, steps=steps, logs=tmp_path, only=["one"])
+    assert ([entry.name for entry in done.entries], done.kept) == (["one", "two"], ("two",))
+    assert done.passed
+    (tmp_path / "one.csv").unlink()
+    failed = commission(ROBUST, CONTROLLER, day, steps=steps, logs=tmp_path, only=["one"])
+    assert ([entry.passed for entry in failed.entries], failed.kept) == ([False, True], ("two",))
+    malta.identification.write_log(steps[0].record(bench()), tmp_path / "one.csv")
+    assert commission(ROBUST, CONTROLLER, day, steps=steps, logs=tmp_path, only=["one"]).passed
+    with pytest.raises(InputError, match="--step: found 'on', expected one of one two"):
+        commission(ROBUST, CONTROLLER, day, steps=steps, only=["on"])
+
+
 def test_a_finding_holds_where_all_of_its_interval_does() -> None:
     assert StepFinding("a", Interval95(1.0, 0.1), 0.9, 1.2).holds
     assert not StepFinding("a", Interval95(1.0, 0.3), 0.9, 1.2).holds
@@ -251,9 +293,10 @@ def test_noise_of_coil_currents_is_that_of_the_forces_where_the_machine_is_held(
 
 
 def test_a_machine_without_current_sensors_says_so() -> None:
-    (only,) = found_in("noise")
+    ((only, found),) = found_in("noise").items()
     assert PLANT.drive.sensors is None
     assert only == "no current sensors: the largest process noise that the gain file has"
+    assert found.unit == "N"
 
 
 def test_the_noise_that_is_written_is_read_by_a_design(tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ from malta.machines.tubular.plant import plant as tubular
 from malta.model.plant import Signal
 from malta.simulation.multisine import interleaved_multisine
 
+pytestmark = pytest.mark.first
+
 if TYPE_CHECKING:
     from malta.model.plant import Plant
 
@@ -92,6 +94,7 @@ def test_a_flight_as_planned_stays_in_the_window(plan: ExcitationPlan, log: Log)
     assert (window < 10e-6 + 3 * motion + 6 * np.array([0, 0, 0, 0, 15e-6])).all()
 
 
+@pytest.mark.slow
 def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: ExcitationPlan) -> None:
     """Motion, currents and commands at the lines, against the simulation without noise."""
     run = excited(plan, {}, noise=0.0, quantize=False)
@@ -117,6 +120,7 @@ def test_parameters_are_within_their_intervals(found: Identified, plan: Excitati
     assert found.half_widths[0] / truth[0] < 1.5 * plan.accuracy["K_A"]
 
 
+@pytest.mark.slow
 def test_without_names_those_are_found_that_the_log_tells(log: Log) -> None:
     found = malta.identify(CONTROLLER, log, in_time=False)
     assert not found.dropped.keys() & set(found.names)
@@ -126,6 +130,7 @@ def test_without_names_those_are_found_that_the_log_tells(log: Log) -> None:
     assert found.held["m"] == 0.36
 
 
+@pytest.mark.slow
 def test_only_ratios_are_found_without_a_mass(log: Log) -> None:
     with pytest.raises(malta.CheckError, match=r"only ratios of .*Name one as known, as --known m=0.36"):
         malta.identify(CONTROLLER, log, parameters=[*ASKED, "m", "F_c"])
@@ -159,6 +164,7 @@ def test_no_mass_is_found_in_two_logs_that_are_alike(log: Log) -> None:
         malta.identification.weigh(CONTROLLER, log, log, {"m": 0.1})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [{"I_xx": 1.45e-3, "I_yy": 1.45e-3}, {"l_S": 0.09}, {"K_D": 5.2}])
 def test_a_wrong_model_is_refused(log: Log, known: dict[str, float]) -> None:
     found = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B"], known=known)
@@ -190,9 +196,12 @@ def test_a_refusal_names_the_parameter_that_explains_it(log: Log) -> None:
     assert share > 0.8
     assert " or l_S +4" in wrong.refusal
     late = with_columns(log, i=np.vstack([log.columns["i"][:1], log.columns["i"][:-1]]))
-    refused = malta.identify(CONTROLLER, late, parameters=["K_A", "K_B"])
-    assert refused.refusal.endswith("; no parameter by itself explains half of it")
-    assert max(abs(change) for change, _ in refused.explained.values()) < 0.5
+    skewed = malta.identify(CONTROLLER, late, parameters=["K_A", "K_B"])
+    # No parameter of the machine explains half of it: a skew of a sample does.
+    assert max(share for _, share in skewed.explained.values()) < 0.5
+    assert skewed.explanation is not None
+    assert skewed.explanation.causes[0].name == "skew"
+    assert skewed.explanation.causes[0].value == pytest.approx(-50e-6, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -209,11 +218,13 @@ def test_a_parameter_that_differs_from_its_twin_is_found_where_it_is_named(plan:
     assert (np.abs(apart.in_time.values[2:] - list(true.values())) < 1.5 * apart.half_widths[2:]).all()
 
 
+@pytest.mark.slow
 def test_currents_that_are_a_sample_late_are_refused(log: Log) -> None:
     late = with_columns(log, i=np.roll(log.columns["i"], 1, axis=0))
     assert malta.identify(CONTROLLER, late, parameters=ASKED).chi2 > 10
 
 
+@pytest.mark.slow
 def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
     y, k = log.columns["y"], log.samples
     stuck, clipped, missing = np.array(y), np.clip(y, -12e-6, 12e-6), np.array(y)
@@ -233,7 +244,7 @@ def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
         ),
         "y1 is stuck": with_columns(log, y=stuck),
         "x1 is clipped": with_columns(log, y=clipped),
-        "samples of y are missing": with_columns(log, y=missing),
+        r"25 % of the readings of \w+ are missing": with_columns(log, y=missing),
         "too short": short,
         "nothing was excited": with_columns(log, **quiet),
         "a log of machine rotor": replace(log, machine="rotor"),
@@ -333,7 +344,7 @@ def test_outliers_move_nothing(log: Log, found: Identified) -> None:
 
 
 @pytest.mark.slow
-def test_a_torque_that_the_model_lacks_is_refused(plan: ExcitationPlan) -> None:
+def test_a_torque_that_the_model_lacks_is_named_and_moves_no_parameter(plan: ExcitationPlan) -> None:
     """z m g about x, as of weights that are not where the forces are."""
 
     def variant(par: Any) -> Plant:
@@ -347,9 +358,21 @@ def test_a_torque_that_the_model_lacks_is_refused(plan: ExcitationPlan) -> None:
     scenario = malta.Scenario.excited(plan.signal, plan.duration)
     run = malta.simulate(variant(CONTROLLER.parameters), CONTROLLER, scenario)
     found = malta.identify(CONTROLLER, malta.identification.log_of(run), parameters=ASKED)
-    assert "does not explain the log" in found.refusal
+    assert found.chi2 > 5
+    assert found.explanation is not None
+    first = found.explanation.causes[0]
+    assert "stiffness_alpha_z" in (first.name, *first.alike)
+    truth = np.array([getattr(CONTROLLER.parameters, name) for name in ASKED])
+    assert (np.abs(found.values - truth) < found.total).all()
+    # A single parameter that would explain it as well makes a loop that was not measured.
+    wrong = malta.identify(CONTROLLER, found.log, parameters=[*ASKED, "hall_amplitude"])
+    assert (
+        "does not have the loop that was measured" in wrong.refusal
+        or abs(wrong.values[2] - 5.2) < wrong.total[2]
+    )
 
 
+@pytest.mark.slow
 def test_curvature_is_taken_off_the_lines(plant: Plant, plan: ExcitationPlan) -> None:
     """Without noise: what the linear response leaves is what lever arms that move with the stroke add."""
     log = malta.identification.log_of(excited(plan, {}, noise=0.0, quantize=False))
@@ -367,6 +390,7 @@ def test_curvature_is_taken_off_the_lines(plant: Plant, plan: ExcitationPlan) ->
     assert left(straighten(model, s, model.start)) < 0.02 * left(s)
 
 
+@pytest.mark.slow
 def test_errors_of_sensors_are_parameters_too(plan: ExcitationPlan) -> None:
     run = excited(plan, {}, sensor_errors={"gain_x1": 0.02})
     found = malta.identify(CONTROLLER, malta.identification.log_of(run), parameters=["K_A", "gain_x1"])
@@ -383,7 +407,7 @@ def test_the_data_file_keeps_intervals(found: Identified, tmp_path: Path) -> Non
     data = read_identified(path)
     assert found.values[0] == data.parameters.K_A
     assert list(data.shares) == ["I_xx", "K_A", "K_B", "K_D"]
-    assert data.shares["K_A"] == pytest.approx(found.half_widths[0] / found.values[0], rel=1e-9)
+    assert data.shares["K_A"] == pytest.approx(found.total[0] / found.values[0], rel=1e-9)
     assert data.joint == pytest.approx(3.0802 / 1.95996, rel=1e-4)  # sqrt of chi2 of 4 at 95 %
     with pytest.raises(malta.InputError, match=r"suffix '.json', expected .toml"):
         write_data(found, tmp_path / "found.json", gains=ROBUST, known={})
@@ -391,6 +415,7 @@ def test_the_data_file_keeps_intervals(found: Identified, tmp_path: Path) -> Non
         read_identified("data/tubular.toml")
 
 
+@pytest.mark.slow
 def test_a_law_replays_its_own_log_and_no_other() -> None:
     run = malta.simulate(changed({"m": 0.4}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
     log = malta.identification.log_of(run)
@@ -407,6 +432,7 @@ def test_a_law_replays_its_own_log_and_no_other() -> None:
     assert "another law or other gains flew" in other.refusal
 
 
+@pytest.mark.slow
 def test_a_replay_refuses_what_its_law_did_not_fly() -> None:
     """Sensors with half of their noise, in steps, have innovations that are correlated otherwise."""
     stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True, seed=3)
@@ -438,6 +464,7 @@ def test_excited_flights_are_replayed_too(log: Log) -> None:
     assert max(found.at_once.values()) < 1e-9
 
 
+@pytest.mark.slow
 def test_exported_laws_take_an_excitation(plan: ExcitationPlan) -> None:
     """The compiled C flies the multisine as the law does, and its log is replayed; what is no force is none."""
     scenario = malta.Scenario.excited(plan.signal, 0.05)
@@ -519,7 +546,9 @@ def test_coil_positions_of_the_planar_motor_are_found_where_they_are_named() -> 
     assert (np.abs(off) < 1.5).all()
     assert found.half_widths[0] / found.values[0] < 1e-3
     held = malta.identify(controller, log, parameters=list(true)[:-1])
-    assert held.refusal.split("; ")[1].startswith("coil_pitch +0.2")
+    assert held.chi2 > 10 * held.limit
+    assert held.explanation is not None
+    assert [one.name for one in held.explanation.causes] == ["coil_pitch"]
     assert held.explained["coil_pitch"][1] > 0.8
 
 
@@ -571,7 +600,8 @@ def test_the_drive_is_identified_from_voltages_and_currents(warm: Log) -> None:
     assert found.chi2 == pytest.approx(1, abs=0.2)
     truth = {"R": 2.6, "L": 2.5e-3, "dead time": 125e-6}
     for name, (one, believed) in found.estimates.items():
-        assert abs(one.value - truth[name]) < 2 * one.half < 1e-3 * truth[name]
+        assert abs(one.value - truth[name]) < 2 * one.half
+        assert one.half < 6e-4 * truth[name]  # 5.1e-4 of the dead time where this was measured
         assert believed == {"R": 2.2, "L": 2.8e-3, "dead time": 75e-6}[name]
     # |Kp + Ki/(jw)| / |R + jwL| = 1, and 50 us more of dead time take off w 50 us
     loop, w = CONTROLLER.current_loop, found.crossover

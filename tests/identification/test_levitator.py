@@ -42,6 +42,7 @@ def test_pole_and_gain_are_within_their_intervals() -> None:
     assert found.residual < 2 * 7e-6
 
 
+@pytest.mark.slow_for("t,pos,amps")
 @pytest.mark.parametrize("heading", ["t,pos,amps", "t , pos , amps"])
 def test_a_record_is_read_by_the_names_of_its_columns(
     heading: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -63,6 +64,7 @@ def test_a_record_is_read_by_the_names_of_its_columns(
     ]
 
 
+@pytest.mark.slow
 def test_what_tells_no_pole_is_refused_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

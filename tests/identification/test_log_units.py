@@ -58,5 +58,5 @@ def test_units_of_others_are_converted(tmp_path: Path) -> None:
     assert [tuple(s) for s in found.signals["y"]] == [("x", "m"), ("a", "m/s^2")]
     assert found.columns["y"].tolist() == [[1e-6, 1.0], [2e-6, 2.0]]
     file.write_text("t [ms],x [um],y.a [quarks]\n0,1,1\n1,2,2\n", encoding="utf-8")
-    with pytest.raises(malta.InputError, match=r"a \[quarks\].*found 'quarks', expected a unit"):
+    with pytest.raises(malta.InputError, match=r"a \[quarks\].*found unit 'quarks', expected"):
         read_log(file)

@@ -13,7 +13,11 @@ from conftest import Run
 
 import malta
 from malta.identification import log_files
+from malta.identification.log_view import view_log
+from malta.identification.readers import numbers
+from malta.identification.readers.numbers import Dialect
 from malta.identification.spectra import in_axes
+from malta.model.plant import Signal
 from malta.report.figures import log_figure
 
 ROBUST = "design/gains/robust.json"
@@ -96,7 +100,7 @@ def test_compiled_c_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pyte
     found = []
     for module in (log_files, None):
         if module is None:
-            monkeypatch.setattr(log_files, "_fast_columns", lambda *_: None)
+            monkeypatch.setattr(numbers, "fast_rows", lambda *_: None)
         monkeypatch.setattr(log_files, "MAX_READING", np.inf)
         found.append(malta.identification.read_log(path))
     for group, table in found[0].columns.items():
@@ -104,11 +108,11 @@ def test_compiled_c_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    "row", ["1,2", "1,2,3,4", "1,a,3", "1,1.2.3,4", "1,0x2,3", "1,-,3", "1,2e,3", "1,2 3,4"]
+    "row", ["1,2", "1,2,3,4", "1,a,3", "1,1.2.3,4", "1,0x2,3", "1,+,3", "1,2e,3", "1,2 3,4"]
 )
 def test_compiled_c_leaves_to_numpy_what_is_no_table_of_numbers(row: str) -> None:
     rows = f"0,1,2\n{row}\n".encode()
-    assert log_files._fast_columns(rows, 0, 3, [0, 1, 2]) is None
+    assert numbers.fast_rows(rows, Dialect("utf-8", ",", ".", 0, "nnn"), [0, 1, 2]) is None
 
 
 @pytest.mark.parametrize(
@@ -116,11 +120,11 @@ def test_compiled_c_leaves_to_numpy_what_is_no_table_of_numbers(row: str) -> Non
     [
         ("", "no line of headings"),
         ("t [s],x1\n0,1\n1,2\n", "a heading without unit"),
-        ("t [s],x1 [kg]\n0,1\n1,2\n", "unit 'kg'"),
+        ("t [s],x1 [kg]\n0,1\n1,2\n", r"not used: x1 \[kg\]"),
         ("t [s],x1 [m]\n0,1\n0,2\n", "times that do not rise"),
         ("t [s],x1 [m]\n0,1\n1,a\n", "cannot be read"),
         ("t [s],fx [N]\n0,1\n1,2\n", "no measured outputs"),
-        ("x1 [m],t [s]\n0,1\n1,2\n", "the first column"),
+        ("x1 [m],a [A]\n0,1\n1,2\n", "no column of times"),
         ("t [s],x1 [m]\n", "headings alone"),
         ("t [s],x1 [m]\n0,1\n1,1e308\n", r"1e\+308 in sample 2"),
         ("t [s],x1 [m]\n0,1\n1e40,2\n", "times that do not rise"),
@@ -156,7 +160,28 @@ def test_a_log_of_few_samples_or_of_zeros_is_answered(log: malta.identification.
         with pytest.raises(malta.CheckError, match="5 samples of a reference"):
             ask(controller, replace(log, t=log.t[:5], columns=few))
     zeros = {group: 0 * table for group, table in log.columns.items()}
-    assert len(log_figure(replace(log, columns=zeros)).axes) == 1
+    assert len(log_figure(replace(log, columns=zeros)).axes) == 2 * len(log.names("y"))
+
+
+def test_a_picture_has_envelope_spectrum_and_excited_lines_of_each_signal() -> None:
+    t = 1e-4 * np.arange(25_000)
+    force, y = 3 * np.sin(2 * np.pi * 40 * t), 5e-6 * np.sin(2 * np.pi * 40 * t + 1)
+    y[7_003] = -2e-3
+    y[12_000:12_100] = np.nan
+    signals = {"y": (Signal("x", "m"),), "excitation": (Signal("f", "N"), Signal("g", "N"))}
+    columns = {"y": y[:, None], "excitation": np.column_stack([force, 0 * force])}
+    log = malta.identification.Log("made", "", "", 1e-4, 0.025, t, columns, signals)
+    x, f = view_log(log)
+    assert (x.name, f.name, len(x.t)) == ("x", "f", 1000)
+    assert np.nanmin(x.low) == -2e-3  # one sample of a line that is one pixel of 25 samples wide
+    assert np.isnan(x.low[480:484]).all()
+    assert np.nanmax(x.high) == pytest.approx(5e-6, rel=1e-3)
+    assert f.lines == pytest.approx([40.0])
+    assert f.at_lines == pytest.approx([3.0], rel=1e-9)
+    assert x.at_lines == pytest.approx([5e-6], rel=0.05)
+    assert f.f[f.amplitude.argmax()] == pytest.approx(40, rel=0.03)
+    figure = log_figure(log)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["x [µm]", "", "exc. f [N]", ""]
 
 
 def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.identification.Log) -> None:

@@ -18,6 +18,8 @@ from malta.identification import ExcitationPlan, Log, Measurement, measure as me
 from malta.identification.excite import cut_loop
 from malta.identification.spectra import interpolate_columns
 from malta.report.figures import measured_figure
+from malta.report.page.bench import log_items
+from malta.report.page.sections import Illustration
 
 if TYPE_CHECKING:
     from malta.identification.measure import Curve
@@ -68,6 +70,22 @@ def test_the_loop_that_is_cut_is_that_of_malta_loop() -> None:
     assert pytest.approx(nominal.SP, abs=1e-9 * np.abs(nominal.SP).max()) == SP
 
 
+def test_a_page_shows_the_log_the_loop_and_the_machine_in_it(log: Log) -> None:
+    """Signals stand by unit and size: 9 um of x1 beside 9 um of z, 0.1 mA of some currents not beside 0.5 A."""
+    strips, measured, identified, verdict = log_items(CONTROLLER, log, {})
+    assert isinstance(strips, Illustration)
+    assert isinstance(measured, Illustration)
+    assert isinstance(identified, Illustration)
+    assert str(verdict).startswith("malta identify: ")
+    panels = [axes.get_ylabel() for axes in strips.draw().axes]
+    assert panels == ["[µm]", "[mA]", "[µA]", "[N]"]
+    assert defects(strips.draw()) == []
+    assert len(measured.draw().axes) == 4 * len(PLANT.outputs)
+    assert "|S| of z [1]" in [axes.get_ylabel() for axes in identified.draw().axes]
+    still = replace(log, period=0.0)  # without an excitation there is no loop to measure
+    assert len([*log_items(CONTROLLER, still, {})]) == 1
+
+
 def share_within(curve: Curve, truth: Any, factor: float = 1.96) -> float:
     """The share of the lines and channels whose 95 % band holds the magnitude of the truth."""
     return float((np.abs(curve.size - np.abs(truth)) < factor * curve.deviation).mean())
@@ -97,6 +115,7 @@ def test_disk_margins_are_those_of_the_machine_at_the_lines(found: Measurement) 
     assert found.disks[-1][0].size <= min(disk.size for disk, _ in found.disks[:-1])
 
 
+@pytest.mark.slow
 def test_the_plan_expects_the_bands_that_are_found(plan: ExcitationPlan) -> None:
     expected = malta.identification.plan_measurement(LOOP, **SHORT)
     nominal = malta.measure(CONTROLLER, flown(plan, {}))
@@ -123,6 +142,7 @@ def test_a_planned_width_is_that_of_the_excitation_that_flies() -> None:
     assert planned.worst <= width * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_the_verdict_is_of_the_tube(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measuring, "SAMPLES", 3)
     wide = malta.measure(CONTROLLER, log, uncertainty={"K_A": 0.1, "K_B": 0.1, "K_D": 0.1})
@@ -176,6 +196,7 @@ def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
         malta.measure(CONTROLLER, log, uncertainty={"K_X": 0.1})
 
 
+@pytest.mark.slow
 def test_a_measured_loop_is_drawn(found: Measurement) -> None:
     figure = measured_figure(found)
     assert len(figure.axes) == 20

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +11,6 @@ from conftest import ROOT
 
 import malta
 from malta.identification import Log
-from malta.model import machines
 from malta.model.machines import machine
 from malta.model.parts import attribute_of
 
@@ -22,7 +19,7 @@ SPEED, E_U, L_U = 800.0, 1.2e-6, 0.03
 
 
 @pytest.fixture(scope="module")
-def rotor() -> Iterator[dict[str, Any]]:
+def rotor() -> dict[str, Any]:
     """The design's machine at SPEED, another rotor's unbalance on the true one, and the example's functions."""
     machine(FOLDER / "rotor.py")
     spec = malta.read_design(FOLDER / "design" / "rotor.toml")
@@ -31,10 +28,7 @@ def rotor() -> Iterator[dict[str, Any]]:
     plant = malta.plant_of(replace(par, Omega=SPEED))
     true = malta.plant_of(replace(par, Omega=SPEED, e_u=E_U, l_u=L_U))
     own = {name: attribute_of(plant, MODULE, name) for name in NAMES}
-    yield own | {"plant": plant, "true": true, "controller": controller}
-    del machines._files["rotor"]
-    for name in [name for name in sys.modules if name.startswith(f"{machines.FILES}.rotor")]:
-        del sys.modules[name]
+    return own | {"plant": plant, "true": true, "controller": controller}
 
 
 MODULE: Any = "synchronous"  # beside rotor.py

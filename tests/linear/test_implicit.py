@@ -14,9 +14,11 @@ from flint import acb, acb_mat, arb, ctx
 from hypothesis import given, settings, strategies as st
 from scipy.optimize import brentq
 
+from malta.linear.balls import BALLS, POINTS, enclosed_root
 from malta.linear.branches import INTERVALS, Interval
-from malta.linear.expressions import BALLS, POINTS, MatrixProgram, NotAnalytic, enclosed_root, program
-from malta.linear.implicit import ImplicitRoot, call, implicit_function
+from malta.linear.expressions import ANALYTIC, MatrixProgram, NotAnalytic, program
+from malta.linear.implicit import ImplicitRoot
+from malta.linear.roots import call, implicit_function
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -186,3 +188,8 @@ def test_the_slope_of_a_root_is_no_enclosure() -> None:
         assert (both.foreign, both.implicit) == (("call",), True)
         ((*_, value),) = both.only((0,)).run([arb(4.0)], POINTS)[0]
         assert value.contains(2)
+
+
+def test_what_counts_as_analytic_is_what_balls_enclose() -> None:
+    """A name without an enclosure would be "nothing proven" late; an enclosure without a name would never be used."""
+    assert sorted(ANALYTIC) == sorted({*BALLS.others} - {"root"}) == sorted({*POINTS.others} - {"root"})

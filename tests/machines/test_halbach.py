@@ -333,6 +333,7 @@ def test_current_loop_has_its_phase_margin(par: Parameters, mean_of: int) -> Non
 WINDING = st.floats(0.6, 1.6)
 
 
+@pytest.mark.slow
 @given(winding=st.tuples(WINDING, WINDING, WINDING), x=PLACE)
 def test_unequal_windings_lower_the_force_more_under_position_control(
     winding: tuple[float, float, float], x: float

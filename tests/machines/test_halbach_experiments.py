@@ -23,19 +23,9 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
 from malta.linear.sampling import sample_noise
-from malta.machines.halbach import electronics, electronics as motor, paper as claims, plant as halbach
+from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, Options
-from malta.machines.halbach.experiments import responses, steps_reference
-from malta.machines.halbach.open_loop import (
-    FAULTS,
-    LAWS,
-    fit_servo,
-    lift_force,
-    move_reference,
-    positions_at_rest,
-    servo_step,
-)
-from malta.machines.halbach.paper import HalbachEvidence, open_loop_dip, rise_of_dip
+from malta.machines.halbach.experiments import lift_force, responses, steps_reference
 from malta.machines.halbach.plant import Parameters
 from malta.model.plant import Plant
 from malta.model.printed import published_value
@@ -47,12 +37,22 @@ from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 from malta.synthesis.design_models import sampled_model
 from malta.synthesis.linear_law import linear_law
+from malta_papers.halbach import claims
+from malta_papers.halbach.claims import HalbachEvidence, open_loop_dip, rise_of_dip
+from malta_papers.halbach.experiments import (
+    FAULTS,
+    LAWS,
+    fit_servo,
+    move_reference,
+    positions_at_rest,
+    servo_step,
+)
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.simulation.experiments import Experiment
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 DESIGNS = ("halbach", "halbach_pid")
 SCENARIOS = ("step", "stairs", "ramp", "force", "budget", "identify")
@@ -129,6 +129,7 @@ def _closed(e: HalbachEvidence) -> tuple[FloatArray, FloatArray]:
 # The same by another route
 
 
+@pytest.mark.slow
 def test_20_readings_against_plain_python(controller: Controller) -> None:
     """All quantizers and all noise: 16 000 PWM periods, equal to rounding."""
     plant = plant_for(controller)
@@ -210,6 +211,7 @@ def test_step_of_100_um_with_all_errors(evidence: Mapping[str, HalbachEvidence],
     assert 0.7 < jumped < 0.85
 
 
+@pytest.mark.slow
 def test_the_calm_design_answers_what_the_paper_asked() -> None:
     """Sec. 5.1: response within a minute, no oscillation; at that a stiff loop. What it pays is a slow integral."""
     c = controller_of("halbach_calm")
@@ -306,6 +308,7 @@ def test_vertical_force_of_a_move(evidence: Mapping[str, HalbachEvidence], name:
         assert found(force, law, "moved") == pytest.approx(5e-3, abs=3e-6)
 
 
+@pytest.mark.slow
 def test_vertical_force_with_the_induced_voltage() -> None:
     """Preset emf: the same damping, split."""
     c = controller_of("halbach")
@@ -367,6 +370,7 @@ def test_a_servo_is_found_in_its_step(b: float) -> None:
     assert (fit.m, fit.b) == pytest.approx((3.75, b), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_intervals_of_a_fit_hold_what_they_promise() -> None:
     """Of 200 records with white noise of the laser's size times 100, 95 % of the intervals hold m, and b."""
     t, rng = np.arange(110) * 0.055, np.random.default_rng(0)
@@ -388,6 +392,7 @@ def test_records_that_are_no_steps_are_refused() -> None:
         fit_servo(t[:10], servo_step(t[:10], 3.75, 9.41, 205.0, 2e-3), 2e-3, 205.0)
 
 
+@pytest.mark.slow
 def test_the_open_loop_dips_as_its_reference_is_quick() -> None:
     """At once by 1 - cos(k 5 mm), not at all for the slowest; the rise of -18 % is between."""
     plant = halbach.plant(malta.read("data/halbach.toml"))
@@ -502,6 +507,7 @@ def test_every_row_of_the_ledger_has_its_verdict(
 # Options, limits, refusals
 
 
+@pytest.mark.slow
 def test_electronics_are_options(controller: Controller) -> None:
     plant = plant_for(controller)
     few: dict[str, Any] = {"count": 2}
@@ -533,6 +539,7 @@ def _pressed(F_z: float, **changes: float) -> tuple[Plant, Controller]:
     return malta.plant_of(par), replace(c, parameters=par)
 
 
+@pytest.mark.slow
 def test_limits_are_named_and_nothing_is_nan() -> None:
     hold = Scenario("hold", 1.1, malta.references.hold, fidelity="phase", noise=1.0, quantize=True)
     jump = replace(
@@ -557,6 +564,7 @@ def test_limits_are_named_and_nothing_is_nan() -> None:
     assert np.isfinite(run.p).all()
 
 
+@pytest.mark.slow_for("force-options0")
 @pytest.mark.parametrize(
     ("name", "options"), [("force", {"distance": 60e-3}), ("step", {"distance": 60e-3, "count": 1})]
 )
@@ -588,7 +596,7 @@ BAD: tuple[tuple[str, dict[str, Any], str], ...] = (
     ("ramp", {"distance": 0.2}, "ramp: distance: found 0.2 m, expected at most 0.1 m"),
     ("identify", {"F_z": 1e9}, "identify: F_z: found 1e+09 N, expected above 0 and at most 10000 N"),
     ("budget", {"place": math.nan}, "budget: place: found nan, expected finite"),
-    ("stroke", {}, "scenario: found 'stroke', expected one of step, stairs, ramp, force, budget, identify"),
+    ("stroke", {}, "scenario: found 'stroke', expected one of step, ramp, stairs, force, budget, identify"),
 )
 
 
@@ -618,6 +626,7 @@ def test_design_makes_the_shipped_gain_files(run: Run, tmp_path: Path) -> None:
         assert (tmp_path / f"{name}_step.png").stat().st_size > 20_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_simulate_each_scenario(run: Run, tmp_path: Path, scenario: str) -> None:
     said = run("simulate", GAINS, "--scenario", scenario, "--out", tmp_path)
@@ -645,6 +654,7 @@ def test_simulate_with_options_of_the_electronics(run: Run) -> None:
     assert "pwm: found 'coarse', expected one of exact, plain, fine" in said.err
 
 
+@pytest.mark.slow
 def test_verify(run: Run) -> None:
     said = run("verify", GAINS, "--uncertain", "b=50%")
     assert (said.code, said.err) == (0, "")
@@ -658,6 +668,7 @@ def test_claims(run: Run) -> None:
     assert said.out.startswith("### halbach, L. C. Díaz-Pérez et al., Actuators 7(4), 2018")
 
 
+@pytest.mark.slow
 def test_campaign_of_a_few_machines(run: Run, tmp_path: Path) -> None:
     said = run(
         "campaign",

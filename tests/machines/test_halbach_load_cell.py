@@ -12,9 +12,9 @@ import pytest
 import malta
 from malta.machines.halbach import electronics
 from malta.machines.halbach.load_cell import CELL_NOISE, fit_motor_law, simulated_record
-from malta.machines.halbach.open_loop import identify
 from malta.machines.halbach.plant import Parameters
 from malta.model.plants import plant_of
+from malta_papers.halbach.experiments import identify
 
 PAR: Parameters = malta.read("data/halbach.toml")
 CURRENTS = np.array([0.0, -0.3593, 0.3593])
@@ -42,6 +42,7 @@ def test_the_published_constants_come_back_from_the_simulated_record() -> None:
     assert abs(fit.origin) < 50e-6
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_they_promise() -> None:
     """Of 60 records 95 %, give or take: at least 51 by the binomial law with one chance in 1000."""
     fits = [fit_motor_law(*simulated_record(plant_of(PAR), seed)) for seed in range(60)]

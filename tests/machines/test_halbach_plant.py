@@ -341,6 +341,7 @@ def test_it_starts_in_a_steady_state(par: Parameters, loops: bool) -> None:
         np.testing.assert_allclose(now, before, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_limits_are_kept_in_mind(par: Parameters) -> None:
     e = electronics.electronics(par, IDEAL_ELECTRONICS)
     period, place = _period(e), ca.DM([0.0])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.machines.halbach import electronics, electronics as motor, paper as claims
+from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL_ELECTRONICS, IQ_BITS, Options
 from malta.machines.halbach.plant import Parameters
 from malta.model.plants import plant_of
@@ -21,6 +21,7 @@ from malta.model.printed import published_value
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
+from malta_papers.halbach import claims
 
 GAINS = "design/gains/{}.json"
 PLACE = 0.3e-3  # m, where angles and voltages lie between steps
@@ -63,6 +64,7 @@ def test_fine_steps_end_before_0_and_100_percent(par: Parameters) -> None:
     assert np.abs(fine - counts / 2048).max() * par.V_dc < par.dV_fine / 2 + 1e-12
 
 
+@pytest.mark.slow
 def test_the_working_point_of_the_paper_is_far_from_the_ends(par: Parameters) -> None:
     """At 5 N duty cycles are 32.7 to 67.3 %; the fine steps reach to 14.42 of the supply's 14.46 N."""
     assert electronics.largest_fine_force(par, 0) == pytest.approx(14.4603, abs=1e-4)
@@ -93,6 +95,7 @@ def test_the_ends_cost_eight_times_in_place_and_a_hundred_times_in_force(par: Pa
     assert off("plain", 0) == pytest.approx((2530, 534), rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_ends_in_flight() -> None:
     """At 5 N the ends of the paper's DSP change no bit of a flight. Ends that meet leave the plain PWM's steps."""
     voltages = replace(IDEAL_ELECTRONICS, current_loops=False)
@@ -126,6 +129,7 @@ def test_fixed_point_angles_are_off_by_half_a_step(par: Parameters, bits: int) -
     assert half == pytest.approx({12: 3.635e-6, 24: 0.887e-9}[bits], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_fixed_point_angles_at_rest() -> None:
     """The PID never rests: 0.7 nm rms with 24 bits, and 250 times as much with 16. The LQG comes to rest."""
     worst = {}

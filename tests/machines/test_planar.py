@@ -228,6 +228,7 @@ def test_a_coil_is_conservative(truth: Series) -> None:
         assert abs(np.trace(J)) < 1e-9 * np.abs(J).max()
 
 
+@pytest.mark.slow
 def test_the_coil_is_magpylibs(par: planar.Parameters, truth: Series) -> None:
     """Within 0.02 N of 12, from the field of 9 x 9 poles at the nodes of a coil of our own."""
     magpylib = pytest.importorskip("magpylib")
@@ -329,6 +330,7 @@ def test_bilinear_errors(par: planar.Parameters, truth: Series, n: int, F_x: flo
     assert error[2] == pytest.approx(F_z, rel=0.01)
 
 
+@pytest.mark.slow
 def test_bilinear_errors_fall_fourfold(par: planar.Parameters, truth: Series) -> None:
     x, y, z = quarter(par, 160)
     expected = truth(x, y, z)
@@ -396,6 +398,7 @@ def test_the_traced_table_is_the_table(par: planar.Parameters, table: planar_fie
 # --- Sixteen coils ---
 
 
+@pytest.mark.slow
 def test_the_coil_pitch_decides(par: planar.Parameters, truth: Series) -> None:
     """16/3 and 14/3 tau_n are well conditioned, 4, 5 and 6 tau_n singular, other thirds have a condition above 20."""
     assert commutation.check_pitch(par, truth) == pytest.approx(2.106, abs=2e-3)
@@ -511,6 +514,7 @@ def test_what_no_currents_can_do_is_said(par: planar.Parameters, truth: Series) 
 # --- The mover ---
 
 
+@pytest.mark.slow
 def test_free_fall(par: planar.Parameters, exact: Series) -> None:
     """Without currents the mover falls; an outer wrench moves it as (36) says."""
     f = planar.dynamics(par, exact)
@@ -520,6 +524,7 @@ def test_free_fall(par: planar.Parameters, exact: Series) -> None:
     np.testing.assert_allclose(rate[6:], w / inertia - np.array([0, 0, par.g, 0, 0, 0]), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_hover_holds(par: planar.Parameters, exact: Series) -> None:
     """At the currents of `hover` nothing moves: 6.6 A at most, 171 A^2 in all coils together."""
     i = hover(par, exact, AT)
@@ -529,6 +534,7 @@ def test_hover_holds(par: planar.Parameters, exact: Series) -> None:
     assert i @ i == pytest.approx(170.8, abs=0.1)
 
 
+@pytest.mark.slow
 def test_parameters_may_be_symbols(par: planar.Parameters, exact: Series) -> None:
     """Mass, inertias, gravity, coil pitch and arm, with the two equal inertias as one: the same motion."""
     names = ["m", "I_x", "I_z", "g", "coil_pitch", "r_z"]
@@ -561,6 +567,7 @@ def _linear(f: ca.Function, x: FloatArray, i: FloatArray) -> tuple[FloatArray, F
     return np.array(A), np.array(B)
 
 
+@pytest.mark.slow
 def test_linear_model(par: planar.Parameters, exact: Series) -> None:
     """B is M^-1 K, the stiffnesses of a hovering mover add up to zero (Earnshaw), and held currents do not hold it."""
     f, i = planar.dynamics(par, exact), hover(par, exact, AT)
@@ -674,6 +681,7 @@ def fly_continuously(
     return np.asarray(np.abs(rows).max(axis=0) * 1e6)
 
 
+@pytest.mark.slow
 def test_a_symmetric_start_stays_symmetric(
     par: planar.Parameters, paper: dict[str, Any], exact: Series
 ) -> None:

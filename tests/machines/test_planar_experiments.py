@@ -16,16 +16,7 @@ from conftest import Run
 from scipy.integrate import solve_ivp
 
 import malta
-from malta.machines.planar import (
-    commutation,
-    experiments as experiments,
-    experiments as timings,
-    field,
-    motions,
-    motions as jumps,
-    paper as claims,
-    plant as planar,
-)
+from malta.machines.planar import commutation, field, motions, motions as jumps, plant as planar
 from malta.margins.loop_report import LoopReport
 from malta.model.printed import published_value, read_published
 from malta.report.figures import experiment_figure
@@ -35,6 +26,7 @@ from malta.simulation.experiments.catalogue import cases_of, experiments_of
 from malta.synthesis.law import law
 from malta.synthesis.linear_law import linear_law
 from malta.synthesis.synthesize import braking_errors
+from malta_papers.planar import claims, experiments
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -43,6 +35,8 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
 
 pytestmark = pytest.mark.usefixtures("proven_once")
+
+NAMES = ("step", "jump", "errors", "delay", "timing")
 
 GAINS = "design/gains/planar.json"
 SLOW: dict[str, Any] = {"engine": "virtual machine"}  # half a second a run, and nothing to compile
@@ -82,9 +76,7 @@ def paper() -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def flown(lqg: Design) -> dict[str, Experiment]:
     """Every experiment, once."""
-    return {
-        name: malta.experiment(name, lqg.plant, lqg.controller, **SLOW) for name in experiments.EXPERIMENTS
-    }
+    return {name: malta.experiment(name, lqg.plant, lqg.controller, **SLOW) for name in NAMES}
 
 
 def merits(e: Experiment, label: str = "") -> dict[str, float]:
@@ -96,6 +88,7 @@ def merits(e: Experiment, label: str = "") -> dict[str, float]:
 # --- Designs ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planar", "planar_pid"])
 def test_gain_files_are_of_the_design_files(name: str, request: pytest.FixtureRequest) -> None:
     design: Design = request.getfixturevalue("lqg" if name == "planar" else "pid")
@@ -158,6 +151,7 @@ def test_what_a_coil_model_moves(flown: dict[str, Experiment]) -> None:
     assert found["analytical moves phi by"] == pytest.approx(3.79e-6, abs=0.05e-6)
 
 
+@pytest.mark.slow
 def test_currents_that_act_late_tilt_the_mover(lqg: Design, flown: dict[str, Experiment]) -> None:
     """phi by 0.8 urad with the exact model, a sample late and held; 0.3 urad when the computation takes no time."""
     assert merits(flown["step"], "exact, from (6, 4)")["phi, deviation"] == pytest.approx(
@@ -168,6 +162,7 @@ def test_currents_that_act_late_tilt_the_mover(lqg: Design, flown: dict[str, Exp
     assert np.abs(run.p[:, 3]).max() == pytest.approx(0.296e-6, abs=0.01e-6)
 
 
+@pytest.mark.slow
 def test_the_pid_is_slower_to_arrive(pid: Design) -> None:
     """Its feedforward acts a sample late and nothing predicts: 4.9 um beyond, 3.4 um in z, 0.9 urad."""
     first = cases_of("step", pid.plant, pid.controller)[0]
@@ -193,6 +188,7 @@ def test_sensor_noise(lqg: Design) -> None:
     assert still[:, 0].std() == pytest.approx(15e-9, rel=0.5)
 
 
+@pytest.mark.slow
 def test_the_run_by_another_integrator(lqg: Design, flown: dict[str, Experiment]) -> None:
     """scipy, numpy's decoupling and the mover in heights above the magnets: the same 20 samples to 1e-12 m.
 
@@ -218,6 +214,7 @@ def test_the_run_by_another_integrator(lqg: Design, flown: dict[str, Experiment]
         np.testing.assert_allclose(run.p[k + 1], (x - shift)[:6], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_runge_kutta_step_a_sample_is_enough(lqg: Design) -> None:
     first = cases_of("step", lqg.plant, lqg.controller)[0]
     coarse, fine = (
@@ -239,6 +236,7 @@ def test_the_believed_model_is_a_parameter(lqg: Design) -> None:
 # --- The steps as jumps ---
 
 
+@pytest.mark.slow
 def test_a_law_that_brakes_arrives_and_one_that_does_not_swings(
     flown: dict[str, Experiment], pid: Design
 ) -> None:
@@ -260,6 +258,7 @@ def test_a_law_that_brakes_arrives_and_one_that_does_not_swings(
             assert found["largest force"] == 1000
 
 
+@pytest.mark.slow
 def test_braking_changes_nothing_near_the_reference(lqg: Design, pid: Design) -> None:
     """The linear law is the same, entry by entry, and a quintic flies the same bits."""
     for design in (lqg, pid):
@@ -309,6 +308,7 @@ def test_the_rate_of_approach_is_the_one_that_brakes_within_the_limit(pid: Desig
     np.testing.assert_array_equal(soft.K[3:], pid.controller.K[3:])
 
 
+@pytest.mark.slow
 def test_torques_of_jumps_depend_on_the_gains(pid: Design) -> None:
     """Kp = 1.2 N/um: T_x -2.69 to 2.32 N m with (17)-(24), -0.31 to 0.42 with the table; y is 0.35 mm off."""
     e = malta.experiment("jump", pid.plant, pid.controller, rate=49.6, **SLOW)
@@ -352,6 +352,7 @@ def test_a_hover_corrects_what_the_model_misses(flown: dict[str, Experiment]) ->
         assert merits(flown["errors"], model)["hover: force to correct"] == pytest.approx(force, abs=0.01)
 
 
+@pytest.mark.slow
 def test_coils_further_apart_have_the_torques_that_the_paper_prints(paper: dict[str, Any]) -> None:
     """22/3 tau_n: 1.615, 1.615 and 1.604 N m at 3 A, 4, 5 and 13 % below; the arm of F_z is half the pitch, 65 mm."""
     par: Any = malta.read("data/planar.toml", preset="pitch_22_3")
@@ -390,6 +391,7 @@ def test_the_filter_has_to_know_of_the_delay(flown: dict[str, Experiment]) -> No
     assert left["without, 3 x"] > 30e-6
 
 
+@pytest.mark.slow
 def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment]) -> None:
     """The timed C code gives numpy's currents. Times themselves are for bench/run.py."""
     par = motions.parameters_of(lqg.plant)
@@ -399,7 +401,7 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
         field.simulation_model(par),
         field.Analytical(par),
     ):
-        compiled = timings.compile_function(commutation.decoupling(par, model))
+        compiled = experiments.compile_function(commutation.decoupling(par, model))
         if compiled is None:
             pytest.skip("no C compiler")
         seconds, i = compiled(10, p, W)
@@ -412,13 +414,13 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
 def test_without_a_compiler_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("malta.simulation.engine.compiled.compiler", lambda: None)
     x = ca.SX.sym("x")
-    assert np.isnan(timings.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
+    assert np.isnan(experiments.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
 
 
 # --- Figures and claims ---
 
 
-@pytest.mark.parametrize("name", list(experiments.EXPERIMENTS))
+@pytest.mark.parametrize("name", NAMES)
 def test_figures(flown: dict[str, Experiment], paper: dict[str, Any], name: str) -> None:
     """Every panel has labels with units, and every experiment its own figure, with and without the paper."""
     for published in (paper, None):
@@ -429,12 +431,13 @@ def test_figures(flown: dict[str, Experiment], paper: dict[str, Any], name: str)
         assert "planar" in figure.get_suptitle()
 
 
+@pytest.mark.slow
 def test_the_ledger(
     lqg: Design, flown: dict[str, Experiment], paper: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Chosen numbers are by construction, bounds say how far, speed proves nothing, what is off has a reason."""
-    monkeypatch.setattr("malta.report.ledger.experiment", lambda name, *_, **__: flown[name])
-    monkeypatch.setattr("malta.report.ledger.linear_report", lambda *_: lqg.margins)
+    monkeypatch.setattr("malta_papers.ledger.experiment", lambda name, *_, **__: flown[name])
+    monkeypatch.setattr("malta_papers.ledger.verify", lambda *_: lqg.margins)
     found = {claim.subject: claim for claim in ledger([lqg.spec], paper).claims}
     words = {
         "one coil at 3 A: F_x [N]": "by construction, within 1 %; B_r and the corner radius",
@@ -490,10 +493,11 @@ def test_without_a_fitted_C_forces_are_12_percent_low(
     assert errors(claims.implied_compensation("F_x", evidence))[0] == pytest.approx(0.83, rel=0.05)
 
 
+@pytest.mark.slow
 def test_jumps_without_delay_are_nearer_to_the_paper(pid: Design, paper: dict[str, Any]) -> None:
     """T_x -0.115 to 0.141 by the table, and 6 of 16 extremes; with the sample of computation -0.350 to 0.614, and 3."""
     for delay, ends, within in ((0, (-0.115, 0.141), 6), (1, (-0.350, 0.614), 3)):
-        jumped = motions.soft_jumps(pid.plant, pid.controller, delay=delay, **SLOW)
+        jumped = experiments.soft_jumps(pid.plant, pid.controller, delay=delay, **SLOW)
         evidence: Any = SimpleNamespace(experiments={"jump": jumped}, published=paper)
         found = [claims.extreme("table, soft", "T_x", "v", of, evidence) for of in (np.min, np.max)]
         assert found == pytest.approx(ends, abs=1e-3)
@@ -522,6 +526,7 @@ def test_every_printed_number_is_claimed(paper: dict[str, Any]) -> None:
     assert {key for key in printed(paper) if key} - keys == inputs
 
 
+@pytest.mark.slow
 def test_gain_files_keep_where_axes_brake(pid: Design, tmp_path: Path) -> None:
     files = [tmp_path / f"kept{suffix}" for suffix in (".json", ".npz", ".mat")]
     malta.gains.write(pid.controller, pid.margins, *files)
@@ -590,6 +595,7 @@ def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
     assert 1e-6 < found.batch.deviation[:, 3].max() < 20e-6
 
 
+@pytest.mark.slow_for("arguments7-1-touchdown on the magnets at 0 s")
 @pytest.mark.parametrize(
     ("arguments", "code", "sentence"),
     [
@@ -626,4 +632,4 @@ def test_a_pid_predicts_nothing(pid: Design) -> None:
 
 
 def test_the_main_job_comes_first(lqg: Design) -> None:
-    assert list(experiments_of(lqg.plant)) == ["step", "jump", "errors", "delay", "timing"]
+    assert list(experiments_of(lqg.plant)) == ["step", "jump", "errors", "delay", "timing", "worst-load"]

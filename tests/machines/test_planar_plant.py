@@ -134,6 +134,7 @@ def test_stiffness_against_tilt_is_left(machine: Plant) -> None:
 # --- Coil models ---
 
 
+@pytest.mark.slow_for("5-0")
 @pytest.mark.parametrize(("order", "cells"), [(1, 0), (2, 0), (5, 0), (16, 0), (16, 35), (1, 10)])
 def test_the_named_coil_model_commutates(par: planar.Parameters, order: int, cells: int) -> None:
     """currents() is K(p)^+ W of the coil model that numpy has too; the table's in MX alone."""

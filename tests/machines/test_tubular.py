@@ -448,6 +448,7 @@ def _changed(par: tubular.Parameters, name: str, value: Any) -> tubular.Paramete
     return replace(par, **changes)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(
     f=st.sampled_from(FIELDS),

@@ -19,19 +19,13 @@ from malta.gains.encodings import content_sha256
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular.drive import SIDES, attraction, potential
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.machines.tubular.paper.quantities import (
-    WAIT,
-    Figure13,
-    carried_weight,
-    figure_13,
-    radial_deviation,
-)
 from malta.machines.tubular.plant import centre_of_gravity
 from malta.model.parameters import acting_names, differences, values_of
 from malta.model.plants import plant_of
 from malta.model.rigid_body import rotation
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta_papers.tubular.quantities import WAIT, Figure13, carried_weight, figure_13, radial_deviation
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -317,6 +311,7 @@ def test_modules_that_differ_leave_x_alone_during_a_stroke(
 # --- simulation, campaigns, command line ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
 def test_both_engines_agree_on_unlike_modules(controller: Any, fidelity: Any) -> None:
     plant = plant_of(unlike(5, c_x=1e-4, c_y=-2e-4, dK_B=0.1, e_x=2e-5, e_y=1e-5))
@@ -326,6 +321,7 @@ def test_both_engines_agree_on_unlike_modules(controller: Any, fidelity: Any) ->
     np.testing.assert_allclose(one.p, two.p, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_campaign_draws_modules_that_differ(controller: Any) -> None:
     """Spreads of differences are in their own unit, about 0; a run of the batch is the machine simulated alone."""
     plan = malta.campaigns.Plan(
@@ -360,6 +356,7 @@ def test_a_campaign_of_nothing_but_defaults_runs(controller: Any) -> None:
     assert batch.completed.all()
 
 
+@pytest.mark.slow
 def test_set_on_the_command_line(run: Run) -> None:
     said = run("simulate", GAINS, "--set", "dK_A=5%", "--set", "e_y=-16.3um", "--json")
     assert said.code == 0, said.err

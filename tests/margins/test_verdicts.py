@@ -23,7 +23,8 @@ from malta.app.picture import _figures, solve
 from malta.app.worker import outcome_document
 from malta.display import number
 from malta.gains.file import read
-from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, Outcome
+from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS
+from malta.margins.outcome import Outcome
 from malta.model.plants import plant_of
 from malta.proof.margin import NOT_PROVEN
 from malta.report.page.analysis import key_figures
@@ -50,6 +51,7 @@ def noisy_verdict(mean: float, rng: np.random.Generator, *, at_least: bool = Fal
     return judge_figure(figure, 100.0, at_least=at_least)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_least", [False, True])
 def test_an_interval_decides_wrongly_in_five_of_a_hundred_at_most(at_least: bool) -> None:
     """At the bound itself either decision is an error; two scatters off it hardly one decision is."""
@@ -95,6 +97,7 @@ def test_a_flight_that_fails_with_one_seed_reaches_nothing() -> None:
     assert (found.value, found.source) == (0.0, "stroke, 3 of 4 seeds")
 
 
+@pytest.mark.slow
 def test_verify_judges_what_no_flight_measures(run: Run) -> None:
     """The figures are those of `malta tune --check`; the margin of the proof that is printed is not proven again."""
     spec = malta.read_design(ROOT / "design" / "robust.toml")
@@ -109,6 +112,7 @@ def test_verify_judges_what_no_flight_measures(run: Run) -> None:
     assert found == pytest.approx({name: one.found for name, one in rows.items()}, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_changed_machine_is_judged_and_fails_in_verify(run: Run) -> None:
     said = run("verify", ROBUST, "--no-proof", "--set", "m=0.6", "--set", "K_B=2.5")
     text = " ".join(said.out.split())
@@ -248,7 +252,9 @@ def test_a_tile_has_one_bandwidth_with_its_name(name: str) -> None:
     plant = plant_of(controller.parameters)
     report = malta.verify(malta.linearize(plant, plant.at()), controller)
     asked = Outcome("bandwidth", 400.0, 401.7, "rad/s", BANDWIDTHS["w_n_min"], at_least=True)
-    analysis: Any = SimpleNamespace(report=replace(report, requirements=(asked,)), job=None, plant=plant)
+    analysis: Any = SimpleNamespace(
+        report=replace(report, requirements=(asked,)), job=None, plant=plant, loads=()
+    )
     tile = next(one for one in key_figures(analysis) if one.label == "Bandwidth")
     value = report.bandwidth[BANDWIDTH]
     assert tile.value == f"{number(value / (2 * math.pi), 3)} Hz"

@@ -42,6 +42,7 @@ def test_zones_of_iso_14839_3(peak: float, name: str) -> None:
     assert zone(peak) == name
 
 
+@pytest.mark.slow
 def test_the_peak_is_the_h_infinity_norm(design: Design) -> None:
     """The zoomed grid against a frequency sweep a hundred times as dense."""
     stage = machine_loop(design.model, design.controller)

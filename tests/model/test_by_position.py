@@ -212,6 +212,7 @@ def test_a_pause_without_sums_is_refused(tmp_path: Path) -> None:
 # --- the pause ---
 
 
+@pytest.mark.slow
 def test_sums_wait_while_the_reference_moves(flagship: Flagship) -> None:
     """A heavier machine with a weaker drive: without the pause the stroke charges the sum of axial errors."""
     spec, _, shipped = flagship
@@ -246,6 +247,7 @@ def test_both_engines_wait_alike(flagship: Flagship, monkeypatch: pytest.MonkeyP
     assert compiled.p[:, 4].max() > 4e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", [-15e-3, 0.0, 15e-3])
 def test_the_loop_whose_sums_wait_stands_the_box_too(flagship: Flagship, z: float) -> None:
     """While the sums wait, the axial loop is the one without them: stable at every corner of 350 %."""

@@ -110,6 +110,7 @@ def test_coils_that_cannot_be_get_one_sentence(made: Any, kind: Any, sentence: s
         made()
 
 
+@pytest.mark.slow
 def test_the_plate_flies_on_three_coils() -> None:
     """A law that knows of the open coil has the loop of four coils; one that does not has less of a margin."""
     four, three = (malta.read_design(PLATE / f"{name}.toml") for name in ("plate", "three_coils"))
@@ -130,6 +131,7 @@ def test_the_plate_flies_on_three_coils() -> None:
     assert np.abs(run.p[-1] - run.reference[-1]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_coil_that_is_never_used_does_not_break_the_linear_model() -> None:
     """A structural zero among the currents."""
     three = malta.read_design(PLATE / "three_coils.toml").plant

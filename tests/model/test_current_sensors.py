@@ -38,6 +38,7 @@ def held(controller: Any, engine: Any = "auto", duration: float = 0.02, **change
     return simulate(plant_of(replace(controller.parameters, **own)), controller, scenario, engine=engine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ELECTRIC)
 def test_both_engines_agree(controller: Any, fidelity: Any) -> None:
     """Without steps, whose edges turn rounding into steps."""
@@ -47,6 +48,7 @@ def test_both_engines_agree(controller: Any, fidelity: Any) -> None:
     assert one.verdict.completed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ELECTRIC)
 def test_ideal_sensors_are_the_limit(controller: Any, fidelity: Any) -> None:
     ideal = held(controller, fidelity=fidelity)
@@ -58,12 +60,14 @@ def test_ideal_sensors_are_the_limit(controller: Any, fidelity: Any) -> None:
     np.testing.assert_allclose(noisy.p, not_noisy.p, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_currents_that_follow_at_once_have_no_sensors(controller: Any) -> None:
     """At fidelity force currents are lags of their commands: the bits are those of ideal sensors."""
     one, two = (held(controller, fidelity="force", noise=1.0, s_i=s) for s in (0.0, 0.1))
     assert (one.p == two.p).all()
 
 
+@pytest.mark.slow
 def test_noise_of_the_sensors_is_that_of_their_axes(controller: Any) -> None:
     """The voltage of an axis jumps by Kp times the noise that its transformation leaves of 9 phases."""
     plant = plant_of(replace(controller.parameters, s_i=0.05))
@@ -104,6 +108,7 @@ def test_steps_bound_the_error_of_a_reading(controller: Any) -> None:
     assert 0 < wander[0] < wander[1] < 10e-6
 
 
+@pytest.mark.slow
 def test_lanes_draw_the_noise_of_one_run_alone(controller: Any) -> None:
     """The batch, the run alone, and the recorded lane: the same sensors, the same noise."""
     par: Any = replace(controller.parameters, s_i=0.02, d_i=0.005)

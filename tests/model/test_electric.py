@@ -204,6 +204,7 @@ def test_axis_equations_are_the_windings_seen_from_moving_axes(plant: Plant) -> 
     assert np.abs(dq).max() > 1
 
 
+@pytest.mark.slow
 @given(z=PLACE, speed=st.floats(-3, 3), i=TWELVE)
 def test_coupling_is_the_turning_of_the_axes(plant: Plant, z: float, speed: float, i: list[float]) -> None:
     """d' gets +theta' q, q' gets -theta' d: what keeps T(theta) i still while theta moves."""

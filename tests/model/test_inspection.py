@@ -15,6 +15,7 @@ from conftest import ROOT, Run
 import malta
 from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
+from malta.model.equilibrium import balance
 from malta.model.soundness import unproven
 
 
@@ -176,6 +177,34 @@ def test_an_endless_slope_is_a_kink() -> None:
         assert "a kink at rest" in unproven(plant(force=force), (0.0, 0.0))
 
 
+def test_a_load_that_is_a_number_is_a_column() -> None:
+    """f takes w[0], and the load is a number or a list, as that of the sphere that `malta new` writes."""
+    for load in (-0.981, [-0.981], np.array([-0.981])):
+        heavy = plant(f=lambda x, u, w: ca.vertcat(x[1], (u + w[0]) / PAR.m), load=lambda _, load=load: load)
+        assert balance(heavy, np.zeros(2)).u == pytest.approx([0.981])
+
+
+def test_rounding_beside_a_large_number_is_no_kink() -> None:
+    """A pressure that counts from 1 bar: a step of 1e-8 Pa is lost in it; a kink of the pressure is still one."""
+
+    def cushion(bend: float) -> Plant:
+        def rate(p: Any) -> Any:
+            return ((1.2e5 + p) - 1.01325e5) / 2000 - (1.2e5 - 1.01325e5) / 2000 + bend * ca.fabs(p)
+
+        return plant(
+            states=(Signal("p", "Pa"), Signal("v", "m/s")),
+            outputs=(Signal("y", "Pa"), Signal("y_v", "m/s")),
+            f=lambda x, u, w: ca.vertcat(u - 10 * x[0], rate(x[0]) - x[1] + w),
+            read=lambda x, _: x,
+            position_of=lambda y: y,
+            sensors=Sensors(noise=(1.0, 1e-3)),
+            contacts=Contacts(),
+        )
+
+    assert unproven(cushion(0.0), (0.0, 0.0)) == ""
+    assert "slope of v' along p" in unproven(cushion(1e-4), (0.0, 0.0))
+
+
 def test_a_kink_in_the_speed_is_one() -> None:
     """Coulomb friction of a tenth of a newton."""
     rubbing = plant(f=lambda x, u, w: ca.vertcat(x[1], (u + w - 0.1 * ca.sign(x[1])) / PAR.m))
@@ -243,6 +272,7 @@ def test_what_acts_on_nothing_is_named() -> None:
     assert malta.inspect(idle).proves
 
 
+@pytest.mark.slow
 def test_a_parameter_without_effect_is_named_in_the_answer() -> None:
     """Alone it proves nothing; beside another the answer says that it says nothing of it."""
     loop = malta.loop(plant(force=lambda _, q, i: i + 1e3 * q), LAW)
@@ -257,6 +287,7 @@ def test_a_parameter_without_effect_is_named_in_the_answer() -> None:
 SHIPPED = sorted(ROOT.glob("design/*.toml")) + sorted(ROOT.glob("examples/*/design/*.toml"))
 
 
+@pytest.mark.slow_for("planar")
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda path: path.stem)
 def test_proofs_of_shipped_machines_are_of_these_machines(file: Path) -> None:
     machine = malta.read_design(file).plant
@@ -274,6 +305,7 @@ def _ball(tmp_path: Path, old: str = "", new: str = "") -> Path:
     return tmp_path / "ball.py"
 
 
+@pytest.mark.slow
 def test_the_command_says_it_in_a_line(run: Run, tmp_path: Path) -> None:
     code, out, _ = run("inspect", _ball(tmp_path, "    return par.C *", KINKED))
     assert code == 1
@@ -284,6 +316,7 @@ def test_the_command_says_it_in_a_line(run: Run, tmp_path: Path) -> None:
     assert text.endswith("ball: nothing is proven of it")
 
 
+@pytest.mark.slow
 def test_the_command_says_that_proofs_hold(run: Run, tmp_path: Path) -> None:
     file = _ball(tmp_path)
     for what in (file, file.with_suffix(".toml")):

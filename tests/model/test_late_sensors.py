@@ -26,6 +26,10 @@ from malta.model.plants import plant_of
 from malta.model.sensors import Sensors, split_dead_time, with_lags
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta.synthesis.pid import axes_of
+from malta.tuning.pid import close_loop, parts_of
+from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
+from malta.tuning.search import Effort, model_and_controller
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -59,6 +63,7 @@ def radius(plant: Plant, controller: Any, current_loops: Any = "pi") -> float:
 # --- simulation ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ["force", "dq", "phase"])
 def test_both_engines_agree(controller: Any, fidelity: Any) -> None:
     own = {"tau_s": 3e-5, "T_s": 65e-6}
@@ -67,6 +72,7 @@ def test_both_engines_agree(controller: Any, fidelity: Any) -> None:
     assert one.verdict.completed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead_time", [3e-6, 40e-6, 50e-6, 80e-6, 150e-6])
 def test_a_reading_is_as_old_as_the_dead_time(controller: Any, dead_time: float) -> None:
     """Between samples the motion is smooth: a spline through the true outputs is right to a nanometre."""
@@ -77,6 +83,7 @@ def test_a_reading_is_as_old_as_the_dead_time(controller: Any, dead_time: float)
         np.testing.assert_allclose(run.y[1:, 1], run.p[:-1, 1], rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_reading_lags_by_the_time_constant(controller: Any) -> None:
     """s' = (p - s) / tau, solved on a fine grid through the true outputs; z has Hall sensors, without this lag."""
     tau, parts = 120e-6, 20
@@ -96,6 +103,7 @@ def test_a_reading_lags_by_the_time_constant(controller: Any) -> None:
     assert (plain.y[:, 4] == plain.p[:, 4]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
 def test_no_lag_is_the_limit(controller: Any, fidelity: Any) -> None:
     prompt = stroke(controller, fidelity=fidelity)
@@ -108,13 +116,14 @@ def test_no_lag_is_the_limit(controller: Any, fidelity: Any) -> None:
 @pytest.mark.slow
 def test_lanes_of_different_lags_are_the_runs_alone(controller: Any) -> None:
     lags = np.array([0.0, 1e-5, 2e-5, 5e-5, 1e-4])
-    scenario = Scenario("hold", 0.02, malta.references.hold, noise=1.0, fidelity="force")
+    scenario = Scenario("hold", 0.02, malta.references.hold, noise=1.0, fidelity="force", substeps=4)
     batch = malta.simulation.simulate_many(late(controller, T_s=2e-5), controller, scenario, {"tau_s": lags})
     for k, lag in enumerate(lags.tolist()):
         own = simulate(late(controller, T_s=2e-5, tau_s=lag), controller, replace(scenario, run=k))
         np.testing.assert_allclose(abs(own.p).max(axis=0), batch.deviation[k], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_lag_may_come_on_the_way(controller: Any) -> None:
     changes = ((0.01, {"tau_s": 2e-4}),)
     hold = Scenario("hold", 0.03, malta.references.hold, start={"x": 5e-6}, changes=changes)
@@ -164,6 +173,7 @@ def test_stability_is_lost_at_the_lag_that_the_linear_loop_says(controller: Any)
     assert ends[1] > 5e-6
 
 
+@pytest.mark.slow
 def test_dead_time_of_a_sample_is_a_sample_of_delay(controller: Any) -> None:
     """With lagging currents; current controllers read currents at once, and feel a delay of the voltages alone."""
     one, two = late(controller, T_s=Ts), late(controller, T_d=2.5 * Ts)
@@ -173,6 +183,7 @@ def test_dead_time_of_a_sample_is_a_sample_of_delay(controller: Any) -> None:
         assert machine_system(plant, controller, ["m"], {"z": 0.0})[1].delay == delay
 
 
+@pytest.mark.slow
 def test_the_proven_loop_is_the_loop_that_is_verified(controller: Any) -> None:
     """The uncertain system at its nominal values has the poles of the sampled loop under its loads, lag and all."""
     plant = late(controller, tau_s=2e-4, T_s=Ts)
@@ -206,6 +217,7 @@ def test_the_lag_itself_may_be_uncertain(controller: Any) -> None:
     assert found.lower <= found.upper
 
 
+@pytest.mark.slow
 def test_recovery_is_of_the_true_outputs(controller: Any) -> None:
     """The linear answer to 0.1 N against the simulated one, behind a lag that shows."""
     plant = late(controller, tau_s=3e-4, T_s=Ts, g=0.0, F_c=0.0)
@@ -223,11 +235,37 @@ def test_recovery_is_of_the_true_outputs(controller: Any) -> None:
     assert answer.outputs[0].compliance > prompt.outputs[0].compliance * (1 + 5e-4)
 
 
-def test_a_search_refuses_sensors_that_read_late() -> None:
-    spec = malta.read_design("design/robust.toml")
-    slow = replace(spec, parameters=replace(spec.parameters, tau_s=1e-5))
-    with pytest.raises(malta.InputError, match="sensors that read late"):
-        malta.tune(slow)
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_a_search_of_pid_gains_sees_the_loop_of_late_sensors(share: float) -> None:
+    """Lags, and dead times of whole samples and of parts: figures of a trial are those of the machine's own loop."""
+    spec = malta.read_design("design/tubular_pid.toml")
+    slow = replace(spec, parameters=replace(spec.parameters, tau_s=1e-5, T_s=share * spec.sample_time))
+    model, controller = model_and_controller(slow)
+    loop, axes = malta.loop(slow.plant, controller).sampled, axes_of(model, slow.axes)
+    whole, Ts = whole_machine(model, controller, loads_of(slow)), slow.sample_time
+    prompt = malta.loop(spec.plant, controller).sampled
+    known, quick = loop_figures(slow, whole, loop), dict[str, float]()
+    assert slow.pid is not None
+    for part in parts_of(whole):
+        quick |= loop_figures(slow, part, close_loop(part, slow.pid, Ts, axes))
+    assert quick == {name: pytest.approx(value, rel=1e-6) for name, value in known.items() if name in quick}
+    assert len(quick) > 10
+    before = loop_figures(spec, whole_machine(*model_and_controller(spec), loads_of(spec)), prompt)
+    assert known["peak_sensitivity x1"] > 1.01 * before["peak_sensitivity x1"]
+
+
+@pytest.mark.slow
+def test_tune_takes_a_pid_whose_sensors_read_late() -> None:
+    spec = malta.read_design("design/tubular_pid.toml")
+    between = replace(spec, parameters=replace(spec.parameters, T_s=0.4 * spec.sample_time))
+    with pytest.raises(malta.InputError, match=r"whole samples of 50 us in a proof with PI current loops"):
+        malta.tune(between)  # before it searches
+    slow = replace(spec, parameters=replace(spec.parameters, tau_s=1e-5, T_s=spec.sample_time))
+    tuned = malta.tune(slow, effort=Effort(generations=0, polish=3, front=0))
+    judged = {one.name: one.found for one in tuned.requirements}
+    assert judged["peak_sensitivity"] == pytest.approx(
+        max(v for k, v in tuned.trial.figures.items() if k.startswith("peak_sensitivity")), rel=1e-3
+    )
 
 
 # --- command line ---

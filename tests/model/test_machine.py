@@ -21,7 +21,8 @@ from malta.simulation.inputs import initial_values, inputs_of
 from malta.simulation.layout import FIDELITIES, Fidelity, layout_of
 from malta.simulation.period import initial_state
 from malta.simulation.references import Motion
-from malta.simulation.scenario import Correction, Fault, Scenario, Simulation, setup_of, steps_of
+from malta.simulation.scenario import Correction, Fault, Scenario, Simulation, setup_of
+from malta.simulation.steps import steps_of
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -407,7 +408,10 @@ def _held_command(run: malta.simulation.Trajectory, column: int) -> FloatArray:
 def test_a_missed_step_holds_the_command_before(calibrated: Design) -> None:
     """Steps 40 to 42 miss their time: forces keep following command 39, and the controller stands still."""
     missed = (Fault("missed step", 40 * Ts, 43 * Ts),)
-    scenario = _hold(5e-3, {"x1": 20e-6}, start={"x": 0.0, "beta": 0.0}, fidelity="force", delay=0)
+    start = {"x": 0.0, "beta": 0.0}
+    scenario = _hold(
+        5e-3, {"x1": 20e-6}, start=start, fidelity="force", delay=0, substeps=4
+    )  # as with faults
     whole, late = (
         malta.simulate(calibrated.plant, calibrated.controller, replace(scenario, faults=f), engine=VIRTUAL)
         for f in ((), missed)
@@ -432,7 +436,8 @@ def test_a_lost_sample_is_the_one_before(calibrated: Design) -> None:
     run = malta.simulate(
         calibrated.plant, calibrated.controller, _hold(5e-3, noise=1.0, faults=lost), engine=VIRTUAL
     )
-    whole = malta.simulate(calibrated.plant, calibrated.controller, _hold(5e-3, noise=1.0), engine=VIRTUAL)
+    healthy = _hold(5e-3, noise=1.0, substeps=4)  # as with faults
+    whole = malta.simulate(calibrated.plant, calibrated.controller, healthy, engine=VIRTUAL)
     assert np.array_equal(run.y[40:45], np.tile(run.y[39], (5, 1)))
     noise = whole.y - whole.p
     others = [k for k in range(len(run.y)) if not 40 <= k < 45]
@@ -601,6 +606,7 @@ def test_a_mover_without_current_loses_energy_until_it_rests_on_its_bearings(
         assert np.abs(run.x[-1, 6:]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_without_bearings_a_touch_ends_the_run(calibrated: Design) -> None:
     idle = _with(calibrated, I_max=1e-12)
     scenario = _hold(0.1, start={"y": -0.5e-3}, cold=True, fidelity="force")
@@ -766,6 +772,7 @@ def test_an_outer_loop_that_asks_for_nothing_changes_nothing(calibrated: Design)
     assert np.array_equal(run.x, plain.x)
 
 
+@pytest.mark.slow
 def test_an_outer_loop_that_sees_the_truth_corrects_a_sensor(calibrated: Design) -> None:
     """5 um of offset: with the sensor alone the mover goes where it reads zero; a laser that integrates takes most of
     that back."""
@@ -826,6 +833,7 @@ def test_the_integrator_has_fourth_order_with_windings_too(calibrated: Design, f
         assert errors[2] < largest
 
 
+@pytest.mark.slow_for("phase")
 @pytest.mark.parametrize("fidelity", FIDELITIES)
 def test_nothing_happens_before_the_computation_is_done(calibrated: Design, fidelity: Fidelity) -> None:
     """A step of the reference at t = 0: what holds the mover flows on for `delay` samples to the bit of its trim, and
@@ -841,6 +849,7 @@ def test_nothing_happens_before_the_computation_is_done(calibrated: Design, fide
         assert np.array_equal(run.x, own.x) == (delay == 1)
 
 
+@pytest.mark.slow_for("dq")
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
 def test_the_smaller_limit_counts_of_the_machine_and_of_its_gain_file(
     designs: dict[str, Design], fidelity: Literal["dq", "phase"]

@@ -142,8 +142,8 @@ def test_pickle_keeps_the_parameters(motor: Plant) -> None:
 
 
 def test_simulation_is_the_step_response_of_the_loop(motor: Plant, driven: Controller) -> None:
-    scenario = malta.Scenario("step", 0.4, partial(jump, output=0, size=1e-3, at=9.5e-3), fidelity="force")
-    run = malta.simulate(motor, driven, scenario)
+    at = partial(jump, output=0, size=1e-3, at=9.5e-3)
+    run = malta.simulate(motor, driven, malta.Scenario("step", 0.4, at, fidelity="force", substeps=4))
     first = int(np.argmax(run.reference[:, 0] > 0))
     response = control.step_response(malta.loops.loop_systems(motor, driven).tracking, run.t[:-first])
     assert np.abs(run.p[first:, 0] - 1e-3 * response.outputs.ravel()).max() < 1e-12 * 1e-3
@@ -196,7 +196,7 @@ def test_one_state_is_enough(engine: Any) -> None:
         malta.linearize(plant, plant.at()), malta.synthesis.weights([1], [1], [1], [1e-6]), 0.01
     )
     scenario = malta.Scenario("let go", 1.0, malta.references.hold, start={"x1": 1.0}, fidelity="force")
-    run = malta.simulate(plant, controller, scenario, engine=engine)
+    run = malta.simulate(plant, controller, scenario.replace(substeps=4), engine=engine)
     expected = [1.0]
     K, L, Ad, Bd = (float(M[0, 0]) for M in (controller.K, controller.L, controller.Ad, controller.Bd))
     predicted = 1.0
@@ -350,6 +350,7 @@ def geared(J: Any, b: Any, k: Any) -> Any:
     return [[0, 1], [k / J, -b / J]], [[0], [1 / J]], [[1, 0]]
 
 
+@pytest.mark.slow_for(".json")
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_an_uncertain_system_is_a_machine(suffix: str, tmp_path: Path) -> None:
     """It is designed, proven, simulated and stored, with the poles and the margin of the uncertain system."""

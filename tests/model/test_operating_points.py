@@ -351,6 +351,7 @@ def test_a_moving_operating_point_is_refused_in_one_sentence(off_centre: malta.S
         malta.synthesize(off_centre, malta.linearize(ball, ball.at(q_dot=0.1)))
 
 
+@pytest.mark.slow
 def test_a_payload_ends_where_no_command_carries_it() -> None:
     """Currents that are clipped at 2.5 A make C (bias + 2.5 A)^2 / g0^2 = 30 N at most."""
 

@@ -17,7 +17,7 @@ from malta import report
 from malta.campaigns.result import bounds_of
 from malta.margins.travel import NO_EXTENT
 from malta.model import machines
-from malta.model.parts import part_of, require_part
+from malta.model.parts import parts_of, require_part
 from malta.model.plant import Signal
 from malta.model.signal_groups import inputs_of, lateral_outputs, outputs_of, stroke_unit
 from malta.report import figures
@@ -70,8 +70,9 @@ def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
 
 def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
     found = [require_part(part, "tubular").__name__ for part in ("experiments", "figures", "claims")]
-    assert found == [f"malta.machines.tubular.{name}" for name in ("experiments", "figures", "paper")]
-    assert part_of("figures", toy.name) is None
+    own = [f"malta.machines.tubular.{name}" for name in ("experiments", "figures")]
+    assert found == [*own, "malta_papers.tubular.claims"]
+    assert parts_of("figures", toy.name) == (None, None)
     error = refusal(lambda: require_part("claims", "toy"), Path("claims"))
     assert (error.field, error.found) == ("machine", "'toy'")
     assert "tubular" in error.expected
@@ -89,7 +90,7 @@ def test_what_a_module_lacks_is_not_taken_for_a_machine_that_is_not_there(
     package = sys.modules["malta.machines"]
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     with pytest.raises(ModuleNotFoundError, match="nothing_of_that_name"):
-        part_of("claims", "toy")
+        parts_of("claims", "toy")
 
 
 def test_an_experiment_of_another_machine_is_flown(toy: Plant, designs: dict[str, Design]) -> None:
@@ -125,6 +126,7 @@ def test_an_experiment_of_another_machine_is_flown(toy: Plant, designs: dict[str
         cases_of("rest", toy, controller)
 
 
+@pytest.mark.slow
 def test_without_a_figure_of_its_own_an_experiment_has_that_of_its_first_run(
     toy: Plant, designs: dict[str, Design], tmp_path: Path
 ) -> None:
@@ -141,10 +143,11 @@ def test_without_a_figure_of_its_own_an_experiment_has_that_of_its_first_run(
     ]
     report.stroke_figure(found.run, path=tmp_path / "run.svg")
     assert (tmp_path / "run.svg").stat().st_size > 10_000
-    with pytest.raises(malta.InputError, match="'lunch', expected one of rest, run"):
+    with pytest.raises(malta.InputError, match="'lunch', expected one of rest, worst-load, run"):
         report.experiment_figure(replace(found, name="lunch"))
 
 
+@pytest.mark.slow
 def test_angles_and_torques_have_panels_and_units_of_their_own(
     toy: Plant, designs: dict[str, Design], tmp_path: Path
 ) -> None:
@@ -205,10 +208,16 @@ def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
     gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
     found: Any = SimpleNamespace(gang=gang, extent=NO_EXTENT, plant=angles)
     text = printed(report.gang_table(found))
-    for cell in ("2.0 µm/N", "3.000 N/µm", "4.0 µrad/(N m)", "5.000 N m/µrad"):
+    for cell in ("2.000 µm/N", "3.000 N/µm", "4.000 µrad/(N m)", "5.000 N m/µrad"):
         assert cell in text
+    volts = replace(toy, outputs=(Signal("y", "V"), Signal("a", "m/s^2")), inputs=(Signal("u", "V"),))
+    found = SimpleNamespace(gang={"y": (1, 1, 0.2439, 104), "a": gang["a"]}, extent=NO_EXTENT, plant=volts)
+    (line,) = [line for line in printed(report.gang_table(found)).splitlines() if " y " in line]
+    assert line.split()[-2:] == ["0.2439", "104.0"]  # V/V has no unit
     found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NO_EXTENT, plant=toy)
     assert "from force |SP| [µm/N]" in printed(report.gang_table(found))
+    found.gang["x1"] = (1.0, 1.0, 8.14e-8, 4321.0)  # a stiff machine, and a soft one
+    assert {"0.08140", "0.00432"} <= set(printed(report.gang_table(found)).split())
 
 
 def test_poles_of_damped_and_of_stable_machines(designs: dict[str, Design]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from conftest import ROOT, one_sentence
+from conftest import ROOT, forget_machines, one_sentence
 
 import malta
 from malta.model import machines, parts
@@ -30,22 +30,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> Iterato
     assert run("new", "lev")[0] == 0
     monkeypatch.chdir(tmp_path / "lev")
     yield tmp_path / "lev"
-    forget()
+    forget_machines()
 
 
-def forget() -> None:
-    """Leave no machine of a file behind."""
-    machines._files.clear()
-    for name in [name for name in sys.modules if name.startswith(machines.FILES)]:
-        del sys.modules[name]
-
-
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_new_writes_a_folder_that_runs_at_once(run: Run) -> None:
     """Designed, verified, flown and flown many times by the command line."""
     code, out, err = run("design")
     assert (code, err) == (0, "")
-    forget()
+    forget_machines()
     gains = "design/gains/lev.json"
     code, _, err = run("verify", gains)
     assert code == 2
@@ -63,8 +57,8 @@ def test_new_writes_a_folder_that_runs_at_once(run: Run) -> None:
     assert "100.0" in out
 
 
-def test_the_module_has_at_most_60_lines(folder: Path) -> None:
-    assert len((folder / "lev.py").read_text(encoding="utf-8").splitlines()) <= 60
+def test_the_module_has_at_most_80_lines(folder: Path) -> None:
+    assert len((folder / "lev.py").read_text(encoding="utf-8").splitlines()) <= 80  # as the README says
     assert not [path for path in folder.rglob("*") if "ball" in path.name]
 
 
@@ -142,6 +136,7 @@ def test_wrong_data_is_one_sentence(folder: Path, run: Run) -> None:
         assert expected in one_sentence(err)
 
 
+@pytest.mark.slow
 def test_a_plant_is_written_about_its_operating_point(folder: Path, run: Run) -> None:
     """1 mm above the middle: another stiffness, a pull that the current has to balance, and it stands there."""
     file = folder / "lev.py"
@@ -174,10 +169,11 @@ def test_a_plant_is_written_about_its_operating_point(folder: Path, run: Run) ->
     assert beside.operating_point[0].tolist() == [1e-3, 0.0]
 
 
+@pytest.mark.slow
 def test_a_gain_file_runs_no_code_that_was_not_named(folder: Path, run: Run) -> None:
     """Beside a module of the machine's name, in the folder that the command runs in."""
     assert run("design", "design/lev.toml")[0] == 0
-    forget()
+    forget_machines()
     (folder / "lev.py").write_text("raise SystemExit('run')", encoding="utf-8")
     with pytest.raises(
         malta.InputError, match=r"plant.name: found 'lev', expected one of .*--machine lev.py"
@@ -224,7 +220,7 @@ def test_the_text_of_a_machine_goes_to_a_worker(folder: Path) -> None:
     text = machines.sources_of("lev")
     (name,) = text
     assert name.startswith(f"{machines.FILES}.lev_")
-    forget()
+    forget_machines()
     shutil.rmtree(folder)
     module = machines.load_sources("lev", text)
     assert module.plant.__module__ == name
@@ -245,7 +241,7 @@ def test_parameters_may_stand_in_a_module_beside_the_plant(folder: Path) -> None
     assert machines.module_of(record) is module
     assert malta.plant_of(record).name == "lev"
     sources = machines.sources_of("lev")
-    forget()
+    forget_machines()
     assert machines.load_sources("lev", sources).Parameters.__module__ == type(record).__module__
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import FrozenInstanceError
+import re
+from dataclasses import FrozenInstanceError, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.machines.tubular import plant as tubular
+from malta.model.checks import check_signals
 from malta.model.equilibrium import load_balance
 from malta.model.plant import OperatingPoint
 
@@ -140,3 +142,26 @@ def test_load_balance_leaves_the_machines_own_pull_to_the_controller(plant: Plan
     K_A: float = plant.parameters.K_A  # type: ignore[attr-defined]
     assert balance[0] + balance[2] == pytest.approx(0.0, abs=1e-9)
     assert pull[0] + pull[2] == pytest.approx(-2 * K_A * 1e-3, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("sensors.range", 5, "found 5, expected a tuple, a number for each of the outputs"),
+        ("sensors.noise", 1e-3, "found 0.001, expected a tuple, a number for each of the outputs"),
+        ("sensors.lag", 1e-4, "found 0.0001, expected a tuple, a number for each of the outputs"),
+        ("sensors.dead_time", (1e-4,), "found (0.0001,), expected one number, s"),
+        (
+            "inputs",
+            malta.model.Signal("u", "V"),
+            "found Signal(name='u', unit='V'), expected Signals in a tuple",
+        ),
+        ("outputs", ("y",), "found ('y',), expected Signals in a tuple"),
+    ],
+)
+def test_one_where_there_are_several_is_refused_by_name(field: str, value: Any, expected: str) -> None:
+    plant = malta.linear_machine([[0, 1], [4, 0]], [[0], [1]], [[1, 0]])
+    group, _, name = field.rpartition(".")
+    changed = replace(getattr(plant, group), **{name: value}) if group else value
+    with pytest.raises(malta.InputError, match=re.escape(f"{field}: {expected}")):
+        check_signals(replace(plant, **{group or name: changed}))

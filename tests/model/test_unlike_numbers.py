@@ -102,6 +102,7 @@ def test_the_loop_has_the_poles_of_regulator_and_filter(name: str) -> None:
     assert c.summed == tuple(np.flatnonzero(CASES[name][1]["q_i"]))
 
 
+@pytest.mark.slow_for("three")
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_proven_is_lost_at_the_witness(name: str) -> None:
     plant, c = designed(name)

@@ -29,6 +29,7 @@ SECONDS = float(
 )  # of the tests of a mutant: those that do not end notice it
 PARTS = (
     "malta",
+    "papers",
     "tests",
     "bench",
     "data",

@@ -229,6 +229,7 @@ def test_unit_of_another_kind_is_refused(unit: str, si_unit: str) -> None:
     assert (error.field, error.found, error.expected) == ("name.unit", repr(unit), expected)
 
 
+@pytest.mark.slow_for("unit13")
 @pytest.mark.parametrize(
     "unit",
     [
@@ -270,6 +271,10 @@ def test_text_that_is_no_product_of_units_is_refused_at_once(unit: str) -> None:
         ("((mm))", 1e-3),
         ("1/ms", 1e3),
         ("µm", 1e-6),
+        ("mW/(g K)", 1),
+        ("mbar", 100),
+        ("l/min", 1e-3 / 60),
+        ("pC/N", 1e-12),
         ("%", 0.01),
         ("1", 1),
     ],
@@ -278,6 +283,7 @@ def test_units_are_products_with_powers(unit: str, factor: float) -> None:
     assert unit_factor(unit, "name") == pytest.approx(factor, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_known_symbols_are_the_units_of_pint() -> None:
     """Each with each prefix, bit by bit; in products, whose factors round by their order, nearly so."""
     single = [prefix + symbol for prefix in ("", *units._PREFIXES) for symbol in units._SYMBOLS]

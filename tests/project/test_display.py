@@ -74,6 +74,7 @@ RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.synthesis.Controller], Any]
 }  # fmt: skip
 
 
+@pytest.mark.slow_for("curves", "margins", "stages")
 @pytest.mark.parametrize("name", RESULTS)
 def test_a_result_prints_itself_in_ten_lines(
     name: str, spec: malta.Spec, law: malta.synthesis.Controller
@@ -91,6 +92,7 @@ def test_a_result_prints_itself_in_ten_lines(
     assert labels == [label for label, _ in own.rows] if own else len(labels) >= len(text.splitlines()) - 1
 
 
+@pytest.mark.slow
 def test_the_flagship_stays_within_ten_lines() -> None:
     """Five sensors, eleven figures: what does not fit is counted, and stands in the notebook's table."""
     c = malta.gains.read("design/gains/robust.json")
@@ -110,6 +112,7 @@ def test_rows_that_do_not_fit_are_counted() -> None:
     assert {len(line) for line in text.splitlines()[:-1]} == {COLUMNS}
 
 
+@pytest.mark.slow
 def test_a_picture_has_its_axes_and_its_curves() -> None:
     w = np.geomspace(1, 100, 50)
     text = svg(Curves(w, "frequency [rad/s]", {"|S|": w, "<T>": 1 / w}, "gain [1]", logarithmic=True))

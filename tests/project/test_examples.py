@@ -46,6 +46,7 @@ SLOW = {
     "malta.report.gain_page",
     "malta.report.gang_of_four",
     "malta.report.gang_table",
+    "malta.report.load_limits_figure",
     "malta.report.load_response",
     "malta.report.recovery_figure",
     "malta.report.loop_tables",
@@ -167,6 +168,23 @@ def _examples(name: str, text: str) -> Iterator[doctest.DocTest]:
         yield parser.get_doctest(inspect.getdoc(method) or "", {}, part, None, None)
 
 
+@pytest.mark.slow_for(
+    "malta.excite",
+    "malta.identify",
+    "malta.measure",
+    "malta.Scenario",
+    "malta.verify",
+    "malta.identification.contraction",
+    "malta.identification.ExcitationPlan",
+    "malta.identification.Identified",
+    "malta.identification.learn_strokes",
+    "malta.identification.LearnedStrokes",
+    "malta.identification.Measurement",
+    "malta.identification.MeasurementPlan",
+    "malta.identification.plan_measurement",
+    "malta.loops.Loop",
+    "malta.report.verdict_text",
+)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in DOCUMENTED]
 )

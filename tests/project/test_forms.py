@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import control
 import numpy as np
@@ -112,3 +112,149 @@ def test_matrices_of_matlab_are_a_system_as_the_page_says(tmp_path: Path) -> Non
     found = loadmat(tmp_path / "K.mat")
     law = control.ss(found["A"], found["B"], found["C"], found["D"], found["Ts"].item())
     assert (law.dt, law.D.tolist()) == (1e-3, [[0.1]])
+
+
+# --- every public function that takes a machine, a law, shares or a file, with the second forms of these ---
+
+
+class Ball(NamedTuple):
+    """The ball's machine, its model at rest, its law, and the law's gain file."""
+
+    plant: Any
+    model: Any
+    law: Any
+    file: Path
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Ball:
+    plant = malta.read_design(BALL / "design" / "ball.toml").plant
+    model = malta.linearize(plant, plant.at())
+    law = malta.synthesize(malta.read_design(BALL / "design" / "ball.toml"), model)
+    file = tmp_path_factory.mktemp("ball") / "ball.json"
+    malta.gains.write(law, malta.verify(model, law), file)
+    return Ball(plant, model, law, file)
+
+
+BALL = ROOT / "examples" / "ball"
+HOLD = malta.Scenario("hold", 4e-3, malta.references.hold, fidelity="force", noise=0.0, quantize=False)
+LOADS = {"push": {"w": 0.1}}
+OF_MACHINES: dict[
+    str, Callable[[Any, Any], Any]
+] = {  # what a Plant and a LinearModel at rest have to make the same
+    "loop": lambda plant, law: malta.loop(plant, law).poles,
+    "verify": lambda plant, law: malta.verify(plant, law).poles.closed_loop,
+    "simulate": lambda plant, law: malta.simulate(plant, law, HOLD).p,
+    "simulate_many": lambda plant, law: (
+        malta.simulation.simulate_many(plant, law, HOLD, {"m": np.array([0.05])}).deviation
+    ),
+    "choose_steps": lambda plant, law: malta.simulation.choose_steps(plant, law, HOLD).count,
+    "experiment": lambda plant, law: malta.experiment("hold", plant, law, time=4e-3, noise=0.0).run.p,
+    "loop_systems": lambda plant, law: malta.loops.loop_systems(plant, law).P.A,
+    "recovery": lambda plant, law: malta.loops.recovery(plant, law, LOADS)[0].outputs[0].largest,
+    "trim": lambda plant, _: malta.trim(plant).u,
+    "linearize": lambda plant, _: malta.linearize(plant, malta.trim(plant)).A,
+    "inspect": lambda plant, _: malta.inspect(plant).proves,
+    "lqg": lambda plant, _: malta.lqg(plant, COST, Ts=1e-3).K,
+    "block_diagram": lambda plant, law: len(malta.report.block_diagram(law, plant).axes),
+}
+
+
+@pytest.mark.parametrize("name", OF_MACHINES)
+def test_a_model_stands_for_its_machine(name: str, ball: Ball) -> None:
+    make = OF_MACHINES[name]
+    np.testing.assert_array_equal(make(ball.model, ball.law), make(ball.plant, ball.law))
+    with pytest.raises(malta.InputError, match=r"found .*, expected a .*(Plant|LinearModel)"):
+        make([[1.0]], ball.law)
+
+
+def test_a_system_of_python_control_is_a_law_of_a_loop() -> None:
+    cart_plant = malta.linear_machine(A, B, C)
+    sys = control.ss([[0.5]], [[1.0]], [[20.0]], [[-60.0]], 1e-3)
+    own = malta.loop(cart_plant, malta.synthesis.controller_of(sys, cart_plant))
+    for plant in (cart_plant, malta.linearize(cart_plant, cart_plant.at())):
+        assert np.array_equal(malta.loop(plant, sys).poles, own.poles)
+
+
+LAWLESS: dict[
+    str, Callable[[Ball, Any], Any]
+] = {  # a law is asked for: the name of its file is refused by name
+    "loop": lambda b, law: malta.loop(b.plant, law),
+    "simulate": lambda b, law: malta.simulate(b.plant, law, HOLD),
+    "simulate_many": lambda b, law: malta.simulation.simulate_many(b.plant, law, HOLD, {"m": np.ones(1)}),
+    "experiment": lambda b, law: malta.experiment("hold", b.plant, law),
+    "identify": lambda _, law: malta.identify(law, None),  # type: ignore[arg-type]
+    "identify_record": lambda _, law: malta.identification.identify_record(law, None),  # type: ignore[arg-type]
+    "weigh": lambda _, law: malta.identification.weigh(law, None, None, {}),  # type: ignore[arg-type]
+    "measure": lambda _, law: malta.measure(law),
+    "replay_law": lambda _, law: malta.identification.replay_law(law, None),  # type: ignore[arg-type]
+    "learn": lambda _, law: malta.learn(law, None),  # type: ignore[arg-type]
+    "learn_v0": lambda _, law: malta.identification.learn_v0(law, None),  # type: ignore[arg-type]
+    "learn_strokes": lambda b, law: malta.identification.learn_strokes(b.plant, law),
+    "next_stroke": lambda _, law: malta.identification.next_stroke(law, None),  # type: ignore[arg-type]
+    "campaign": lambda _, law: malta.campaigns.Plan(law, "hold", {"m": 0.1}),
+    "block_diagram": lambda b, law: malta.report.block_diagram(law, b.plant),
+}
+
+
+@pytest.mark.parametrize("name", LAWLESS)
+def test_the_name_of_a_gain_file_is_no_law(name: str, ball: Ball) -> None:
+    for form in (str(ball.file), ball.file):
+        with pytest.raises(
+            malta.InputError,
+            match=rf"{name}: controller: found .*, expected a Controller, as malta.gains.read gives",
+        ):
+            LAWLESS[name](ball, form)
+
+
+def test_an_excitation_is_of_a_loop_and_an_export_of_a_file(ball: Ball, tmp_path: Path) -> None:
+    with pytest.raises(malta.InputError, match=r"excite: loop: found .*, expected a Loop"):
+        malta.excite(ball.law)
+    for export in (malta.export_c, malta.export_fmu):
+        with pytest.raises(
+            malta.InputError, match=r"gains: found .*Controller, expected the name of a gain file"
+        ):
+            export(ball.law, tmp_path / "out")
+
+
+OF_FILES: dict[str, Callable[[Any, Ball, Path], Any]] = {  # a path may be a text
+    "gains.read": lambda form, b, _: malta.gains.read(form(b.file)).K,
+    "gains.write": lambda form, b, to: malta.gains.write(
+        b.law, malta.verify(b.model, b.law), form(to / "x.mat")
+    ),
+    "gains.agrees": lambda form, b, _: malta.gains.agrees(b.law, malta.verify(b.model, b.law), form(b.file)),
+    "verify": lambda form, b, _: malta.verify(form(b.file), stages=False).poles.closed_loop,
+    "read_design": lambda form, _, __: malta.read_design(form(BALL / "design" / "ball.toml")).sha256,
+    "read": lambda form, _, __: malta.read(form(BALL / "ball.toml")).m,
+    "read_published": lambda form, _, __: len(
+        malta.model.read_published(form(ROOT / "data" / "halbach.toml"))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OF_FILES)
+def test_a_path_may_be_a_text(name: str, ball: Ball, tmp_path: Path) -> None:
+    found = [OF_FILES[name](form, ball, tmp_path) for form in (Path, str)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_intervals_stand_for_shares_wherever_a_box_is_asked_for(ball: Ball) -> None:
+    """Values (low, high) about the nominal one; a spread of a campaign is one number, and says so."""
+    plant = malta.linear_machine(cart())
+    law, m = malta.lqg(plant, COST, Ts=1e-3), ball.plant.parameters.m
+    proofs: list[Callable[[Any], Any]] = [
+        lambda box: malta.robust_margin(cart(), law, box).lower,
+        lambda box: malta.robust_margin(malta.loop(plant, law), box).lower,
+        lambda box: malta.worst_case_gain(cart(), law, box).upper,
+    ]
+    for prove in proofs:
+        assert prove({"k": (3.2, 4.8)}) == pytest.approx(prove({"k": 0.2}), rel=1e-3)
+    both = (malta.verify(ball.model, ball.law, {"m": form}).robust for form in (0.2, (0.8 * m, 1.2 * m)))
+    one, two = (margin.lower for margin in both if margin is not None)
+    assert one == pytest.approx(two, rel=1e-3)
+    with pytest.raises(
+        malta.InputError, match=r"campaign: spread m: found \(0.1, 0.3\), expected one number"
+    ):
+        malta.campaigns.Plan(ball.law, "hold", {"m": (0.1, 0.3)})  # type: ignore[dict-item]
+    with pytest.raises(malta.InputError, match="found no parameters"):
+        malta.robust_margin(cart(), law, {})

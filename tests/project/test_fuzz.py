@@ -20,6 +20,7 @@ def test_the_shares_of_the_kinds_are_2000_cases() -> None:
     assert sum(kind.share for kind in KINDS.values()) == 2000
 
 
+@pytest.mark.slow_for("gains.npz", "gains.mat", "design", "campaign", "certificate", "rare")
 @pytest.mark.parametrize("name", KINDS)
 def test_input_is_read_or_refused_in_a_sentence(name: str) -> None:
     _read_all(name, KINDS[name].share // SMOKE)

@@ -9,7 +9,11 @@ from collections.abc import Iterator
 
 from conftest import ROOT
 
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "malta").rglob("*.py"))}
+TREES = {
+    path: ast.parse(path.read_text(encoding="utf-8"))
+    for folder in ("malta", "papers")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+}
 IRREGULAR = re.compile(
     r"""bent|built|chosen|drawn|driven|flown|found|given|gone|held|kept|known|lost|made|seen|
     sent|shown|spent|stuck|taken|taught|told|written""",

@@ -15,7 +15,7 @@ from matplotlib import pyplot
 
 from malta.report import new_figure, save
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 PAGES = [*NOTEBOOKS, *sorted((ROOT / "examples").glob("*/notebook.py"))]

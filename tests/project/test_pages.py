@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT
 from page_examples import agrees, renew, run_page
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#\s]+)")

@@ -75,6 +75,7 @@ def test_durations_are_told_as_people_tell_them(seconds: float, text: str) -> No
     assert duration_text(seconds) == text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["simulate", "campaign"])
 def test_the_commands_refuse_and_obey(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str

@@ -12,9 +12,9 @@ from scipy.stats import binomtest
 import malta
 from malta.campaigns.result import yields_of
 from malta.campaigns.run import main_campaign
-from malta.machines.tubular.paper import SOURCE
-from malta.machines.tubular.paper.quantities import FEWER_SHARE, MACHINES
-from malta.report.ledger import find_tables
+from malta_papers.ledger import find_tables
+from malta_papers.tubular.claims import SOURCE
+from malta_papers.tubular.quantities import FEWER_SHARE, MACHINES
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -34,6 +34,7 @@ CYCLES = "three times as fast, filter without"
 ROUNDING = 1e-9  # figures below it are what floating point leaves
 
 
+@pytest.mark.slow
 def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     block = re.search(r"```python\n(.*?)```", README, re.S)
     assert block is not None
@@ -90,8 +91,8 @@ def test_the_table_of_claims_is_computed(
     machine: str, designs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Yields, of MACHINES on the pages, are computed of FEW: they lie within the interval of these."""
-    monkeypatch.setattr("malta.machines.tubular.paper.quantities.MACHINES", FEW)
-    monkeypatch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", LEARNERS)
+    monkeypatch.setattr("malta_papers.tubular.quantities.MACHINES", FEW)
+    monkeypatch.setattr("malta_papers.tubular.quantities.LEARNERS", LEARNERS)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
     ledger = malta.ledger(specs, malta.model.read_published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)

@@ -174,6 +174,7 @@ def check_edits(name: str, stem: str, count: int, folder: Path) -> int:
     return refused
 
 
+@pytest.mark.slow_for("data-halbach")
 @pytest.mark.parametrize(
     ("name", "stem"), [("design", "halbach_pid"), ("data", "halbach"), ("gain", "halbach")]
 )

@@ -169,6 +169,10 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     )  # fmt: skip
     assert (built.returncode, built.stderr) == (0, "")
     pages = {page: page.read_text(encoding="utf-8") for page in (tmp_path / "site").rglob("*.html")}
+    for text in pages.values():
+        assert "<pre>" not in text  # scrolled by keys
+        assert 'role="heading"><span' not in text  # each heading has its level
+        assert not re.search(r"<dl>\s*<dd>", text)  # a list of terms has terms
     known = {found for text in pages.values() for found in re.findall(r'id="(malta\.[\w.]+)"', text)}
     assert set(all_names()) <= known
     assert json.loads((tmp_path / "site" / "schemas" / "gain.json").read_text())["title"] == "malta gain file"
@@ -189,13 +193,31 @@ def test_every_card_of_the_gallery_has_a_command_and_small_pictures() -> None:
         command = program.commands[name]
         command.make_parser(command.context_class(command, info_name=name)).parse_args(arguments)
     files = {f"{name}{suffix}.png" for name in found for suffix in ("", "_dark")}
-    assert {file.name for file in FOLDER.iterdir()} == files
-    assert sum(file.stat().st_size for file in FOLDER.iterdir()) < 600_000
+    for folder, room in ((FOLDER, 600_000), (FOLDER / "full", 2_500_000)):
+        pictures = {file.name: file.stat().st_size for file in folder.glob("*.png")}
+        assert {*pictures} == files
+        assert sum(pictures.values()) < room
+
+
+def test_every_card_leads_to_the_page_that_makes_it() -> None:
+    """To its large pictures, below the command of the card."""
+    page, pictures = ((DOCS / name).read_text(encoding="utf-8") for name in ("index.md", "pictures.md"))
+    for name, command in cards(page).items():
+        assert f":link: picture-{name}\n:link-type: ref" in page
+        section = pictures.partition(f"(picture-{name})=\n")[2].partition("\n(picture-")[0]
+        assert f"`{command}`" in section
+        assert section.index(f"gallery/full/{name}.png") < section.index(f"gallery/full/{name}_dark.png")
 
 
 def test_a_picture_of_few_colours_keeps_its_paper() -> None:
     picture = Image.new("RGB", (90, 60), (26, 26, 26))
     for k in range(60):
         picture.putpixel((k, k), (4 * k, 200, 255 - 4 * k))
+    picture.paste(
+        (193, 68, 14), (70, 40, 74, 43)
+    )  # a cross of twelve pixels beside shades of blue of twenty each
+    for k in range(60):
+        picture.paste((30 * (k % 8), 100 + 17 * (k // 8), 200), (k, 40, k + 1, 60))
     small = few_colours(picture).convert("RGB")
     assert small.getpixel((80, 5)) == (26, 26, 26)
+    assert small.getpixel((71, 41)) == (193, 68, 14)

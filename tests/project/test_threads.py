@@ -78,6 +78,7 @@ def test_a_block_of_another_thread_leaves_the_limit_of_this_one() -> None:
     assert threads() == {2}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_two_threads")
 def test_public_functions_limit_themselves(model: LinearModel, monkeypatch: pytest.MonkeyPatch) -> None:
     seen, solved = [], np.linalg.solve

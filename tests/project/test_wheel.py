@@ -47,6 +47,8 @@ SHORTER = {  # commands of the page that take minutes, or a target, as the same 
     "malta claims": "malta claims design/table2.toml",
 }
 
+OF_PAPERS = re.compile(r"malta claims|--scenario (force|errors)")  # commands that malta-papers has
+
 pytestmark = pytest.mark.slow
 
 
@@ -67,6 +69,11 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if built.returncode and "No matching distribution" in built.stderr:
         pytest.skip("no package index to fetch the build system from")
     assert built.returncode == 0, built.stderr
+    shutil.copytree(
+        ROOT / "papers", folder / "papers", ignore=shutil.ignore_patterns("__pycache__", "*.egg-info")
+    )
+    command = [*pip, "wheel", "--no-deps", "--wheel-dir", str(folder), str(folder / "papers")]
+    subprocess.run(command, env=environment, capture_output=True, check=True, timeout=300)
     (wheel,) = folder.glob("malta-*.whl")
     venv.create(folder / "environment", with_pip=True)
     bin_ = folder / "environment" / "bin"
@@ -125,6 +132,9 @@ def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> No
             continue
         done = run(program, tmp_path, *SHORTER.get(line, line).split())
         extra = "--study sensitivity" in line and "pip install 'malta[sensitivity]'" in done.stderr
+        if OF_PAPERS.search(line):
+            assert "malta-papers: pip install ./papers" in done.stderr
+            extra = True
         assert done.returncode == (2 if extra else 0), (line, done.stderr)
         assert "Traceback" not in done.stderr
     assert (tmp_path / "design" / "gains" / "table2.json").is_file()
@@ -175,3 +185,17 @@ def test_a_script_beside_a_checkout_imports_the_package(tmp_path: Path) -> None:
         [sys.executable, script], capture_output=True, text=True, check=False, cwd=tmp_path
     )
     assert (ended.stdout, ended.stderr) == ("read_design\n", "")
+
+
+def test_papers_are_found_once_they_are_installed(program: Path, tmp_path: Path) -> None:
+    """The last test of this environment: the commands that it refused before."""
+    (wheel,) = program.parents[1].glob("malta_papers-*.whl")
+    command = [str(program / "python"), "-m", "pip", "--quiet", "install", "--no-deps", str(wheel)]
+    subprocess.run(command, env=own_environment(), check=True, timeout=300)
+    lines = [
+        line for line in re.findall(r"^(malta .*?)(?: +#.*)?$", COMMANDS, re.M) if OF_PAPERS.search(line)
+    ]
+    assert len(lines) >= 3
+    for line in lines:
+        done = run(program, tmp_path, *SHORTER.get(line, line).split())
+        assert (done.returncode, "Traceback" in done.stderr) == (0, False), (line, done.stderr)

@@ -111,6 +111,7 @@ def test_the_blocks_close_the_loop_as_m_says(
     assert ratio == pytest.approx(np.linalg.det(np.eye(4) - M @ np.diag(d)), rel=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000))
 def test_bounds_of_mu_are_reached_by_their_delta(seed: int) -> None:
@@ -134,6 +135,7 @@ def test_bounds_of_mu_are_reached_by_their_delta(seed: int) -> None:
         assert (mu_bound(b, blocks)[0] > 1 - 1e-9).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10_000), st.booleans(), st.sampled_from([None, 1e-3, 0.7]))
 def test_expansions_hold_the_weight(seed: int, inverse: bool, T: float | None) -> None:
@@ -181,6 +183,7 @@ def test_compliance_and_effort_of_a_mass_in_closed_form() -> None:
     assert both.lower == pytest.approx(size, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_compliance_of_the_flagship_in_its_travel() -> None:
     """Axial compliance of the sampled loop, by frequency responses of 60 machines."""
     from malta import gains
@@ -230,6 +233,7 @@ def test_several_blocks_beside_parameters() -> None:
     assert float(at[0]) * m.upper == pytest.approx(1, rel=1e-6)
 
 
+@pytest.mark.slow_for("direct", "discrete")
 @pytest.mark.parametrize("kind", ["direct", "descriptor", "discrete"])
 def test_gains_of_systems_beyond_a_b_c(kind: str) -> None:
     """S of y = P u, u = -0.4 y, on a grid of parameters and frequencies by the transfer function itself."""
@@ -256,6 +260,7 @@ def test_gains_of_systems_beyond_a_b_c(kind: str) -> None:
     assert 0.99 * d.upper <= d.lower <= d.upper
 
 
+@pytest.mark.slow
 def test_the_nominal_loss_is_found_in_any_box() -> None:
     """Sensors whose gain peaks at the nominal k: parameters that move only help, and the loss is the nominal one."""
     s = malta.uncertain(

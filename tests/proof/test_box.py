@@ -100,6 +100,7 @@ def test_the_part_of_a_box_within_another_is_not_too_small(inverted: bool) -> No
                 assert low <= Fraction(nominal) - Fraction(t) * Fraction(width)
 
 
+@pytest.mark.slow
 def test_a_box_of_a_few_digits() -> None:
     """s + p - c, stable where p > c, which is 38 digits below the nominal value."""
     nominal, digit = 5.4e6, math.ulp(5.4e6)

@@ -16,8 +16,9 @@ import malta
 from malta.checker.check import check, require_conditions
 from malta.checker.file import read
 from malta.checker.loop import Refused
+from malta.linear.balls import POINTS
 from malta.linear.branches import INTERVALS, Interval, resolve_branches, without_branches
-from malta.linear.expressions import POINTS, NotAnalytic, program
+from malta.linear.expressions import NotAnalytic, program
 from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Plant, Signal, si
@@ -90,6 +91,7 @@ def test_roots_and_guards_leave_short_rational_matrices(guarded: bool) -> None:
         assert np.array(system.positive(p)).min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [LAW, SAMPLED])
 @pytest.mark.parametrize("guarded", [False, True])
 def test_the_margin_is_proven_up_to_the_witness(law: Any, guarded: bool) -> None:
@@ -132,6 +134,7 @@ def test_the_margin_ends_where_the_branch_does() -> None:
     assert str(m).endswith(f"no unstable machine found up to t = 2.5, where {DOMAIN_END_TEXT}")
 
 
+@pytest.mark.slow
 def test_a_certificate_says_where_its_branch_ends(tmp_path: Path) -> None:
     """The checker shows that the guard does not act on the box; beyond it the certificate does not hold."""
     plant = levitated(replace(PAR, lift=0.4905))

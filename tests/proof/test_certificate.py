@@ -32,7 +32,7 @@ from malta.loops.windings import LAST_STAGE
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof import certificate
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 ROOT = Path(__file__).parents[2]
 HALBACH = ROOT / "design" / "gains" / "halbach.json"
@@ -99,6 +99,7 @@ def test_a_continuous_loop(tmp_path: Path) -> None:
     assert len(found.groups) == 1
 
 
+@pytest.mark.slow
 def test_less_is_claimed_where_the_whole_margin_is_not_proven(tmp_path: Path) -> None:
     system, law, box = spring(), gain(1.0), {"m": 0.1, "k": 0.1}
     margin = replace(malta.robust_margin(system, law, box), lower=8.0)  # more than there is: 7.5
@@ -110,6 +111,7 @@ def test_less_is_claimed_where_the_whole_margin_is_not_proven(tmp_path: Path) ->
         certificate.write_certificate(tmp_path / "c.json", [(system, law)], box, None, margin)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "lag"), [(0, None), (2, None), (1, 50.0)])
 def test_a_sampled_loop_with_delay_and_lag(tmp_path: Path, delay: int, lag: float | None) -> None:
     own = Compensator(
@@ -243,6 +245,7 @@ def cross(coupling: float, **options: Any) -> Compensator:
     return Compensator(*none, np.array([[1.0, coupling], [coupling, 1.0]]), **options)
 
 
+@pytest.mark.slow_for("system2-law2", "system3-law3", "system4-law4")
 @pytest.mark.parametrize(
     ("system", "law"),
     [
@@ -357,6 +360,11 @@ def stripped(content: dict[str, Any]) -> None:
     content["loops"][0]["groups"][0]["states"] = [0]
 
 
+@pytest.mark.slow_for(
+    "raised_with_its_box-zero is not excluded",
+    "turned-zero is not excluded",
+    "kept_less-zero is not excluded",
+)
 @pytest.mark.parametrize(
     ("change", "why"),
     [
@@ -536,6 +544,7 @@ def test_determinant_bounds_are_bounds() -> None:
 # the command line
 
 
+@pytest.mark.slow
 def test_verify_writes_and_check_confirms(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "c.json"
     code, out, _ = run(
@@ -557,6 +566,7 @@ def test_verify_writes_and_check_confirms(run: Run, tmp_path: Path) -> None:
     assert run("check", "pyproject.toml")[0] == 2
 
 
+@pytest.mark.slow
 def test_a_first_look_without_the_proof(run: Run) -> None:
     code, out, err = run("verify", str(HALBACH), "--uncertain", "b=20%", "--no-proof")
     assert (code, err) == (0, "")
@@ -590,6 +600,7 @@ def test_ctrl_c_prints_what_stands(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     assert err == "malta: interrupted; proven 150.00 %, lost at 175.00 %\n"
 
 
+@pytest.mark.slow
 def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("malta.cli.output.PATIENCE", 0.0)
     monkeypatch.setattr("malta.cli.output.INTERVAL", 0.0)
@@ -626,6 +637,7 @@ def test_a_design_whose_rounding_couples_all_states(tmp_path: Path) -> None:
     )  # four axes in the middle of the travel, of which pairs are coupled at its end
 
 
+@pytest.mark.slow
 def test_verify_asks_for_the_worst_case(run: Run) -> None:
     code, out, err = run("verify", str(HALBACH), "--no-proof", "--worst-case")
     assert (code, err) == (0, "")

@@ -25,7 +25,7 @@ from malta.loops.windings import CurrentLoops
 from malta.margins import travel
 from malta.margins.travel import travel_loops
 from malta.proof import certificate
-from malta.report.tables.design import claim_share
+from malta.report.tables.certificate import claim_share
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -192,6 +192,7 @@ def test_what_claims_less_or_something_else_is_refused(
     assert "changed after it was written" in check(written(content, tmp_path, signed=False)).failures[0]
 
 
+@pytest.mark.slow
 def test_the_box_alone_is_believed_without_a_gain_file(document: Content, tmp_path: Path) -> None:
     content = copy.deepcopy(document)
     a_box_a_quarter_as_wide(content)
@@ -292,6 +293,7 @@ def test_stated_intervals_lie_in_those_that_are_proven() -> None:
         assert exactly(math.nextafter(last, math.inf)) > high
 
 
+@pytest.mark.slow
 def test_boxes_hold_their_shares_exactly() -> None:
     """Widths in doubles would miss shares and ends by half a digit."""
     rng, missed = np.random.default_rng(6), 0
@@ -359,6 +361,7 @@ def test_places_are_those_of_the_machine(tmp_path: Path, run: Run) -> None:
 # what is more than the claim
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ranges", "lower"),
     [
@@ -373,6 +376,7 @@ def test_a_larger_box_implies_the_claim(tmp_path: Path, ranges: dict[str, Any], 
     assert found.claim == pytest.approx(0.999 * lower)
 
 
+@pytest.mark.slow
 def test_the_box_may_be_named(document: Content, tmp_path: Path) -> None:
     path = written(document, tmp_path)
     for uncertain in ({"b": 0.05, "R": 0.2}, {"m": (3.5, 4.0)}):
@@ -389,12 +393,14 @@ def test_the_box_may_be_named(document: Content, tmp_path: Path) -> None:
         check(path, uncertain={"m": 0.1})
 
 
+@pytest.mark.slow
 def test_the_encoding_of_the_gain_file_does_not_matter(document: Content, tmp_path: Path) -> None:
     path = written(document, tmp_path)
     for suffix in (".npz", ".mat"):
         assert check(path, HALBACH.with_suffix(suffix)).ok
 
 
+@pytest.mark.slow
 def test_a_law_verified_again_is_the_same_law(document: Content, tmp_path: Path) -> None:
     content = json.loads(HALBACH.read_text())
     content["verification"]["robust"]["lower"] = 1.0
@@ -506,6 +512,7 @@ def test_check_prints_the_box_and_whose_it_is(run: Run, document: Content, tmp_p
     assert (code, err.count("\n")) == (2, 1)
 
 
+@pytest.mark.slow
 def test_digits_are_cut_towards_less(document: Content, tmp_path: Path, run: Run) -> None:
     content = copy.deepcopy(document)
     claiming(content, 3.9399999)

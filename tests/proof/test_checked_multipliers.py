@@ -30,6 +30,7 @@ def proven(n: int, T: float | None, target: float = 1.0) -> MultiplierProof:
     return s.proof()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("T", [None, 1.5])
 def test_what_is_kept_confirms_the_proof(T: float | None) -> None:
     assert refusal(proven(1, T)) == ""

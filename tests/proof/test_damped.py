@@ -42,6 +42,7 @@ def feedback(gain: float, T: float | None) -> malta.proof.Compensator:
     return malta.proof.Compensator(none, np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-gain]]), 0, T)
 
 
+@pytest.mark.slow_for("0.001-0.001", "0.0001-0.001", "1e-05-0.001", "1e-06-0.001", "1e-07-0.001")
 @pytest.mark.parametrize("T", [None, 1e-3])
 @pytest.mark.parametrize("zeta", DAMPING)
 def test_one_mode_is_stable_until_its_frequency_is_zero(zeta: float, T: float | None) -> None:
@@ -107,6 +108,7 @@ def signs_of(system: Any, law: Any, ranges: Any, reach: float) -> Signs:
     return found
 
 
+@pytest.mark.slow_for("0-0.3", "1-0.3", "2-0.3")
 @pytest.mark.parametrize("T", [None, 0.3])
 @pytest.mark.parametrize("seed", range(3))
 def test_no_sample_of_a_proven_box_is_unstable(seed: int, T: float | None) -> None:

@@ -24,6 +24,7 @@ def robstab() -> malta.proof.UncertainSystem:
     return malta.uncertain(ROBSTAB[0].matrices, ROBSTAB[0].nominal)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "k"), [(ROBSTAB[0], 3.603), (ROBSTAB[1], -1.630)])
 def test_a_parameter_and_dynamics_of_robstab(case: Loop, k: float) -> None:
     """MATLAB's reference page of robstab prints 1.5960 .. 1.5993 for k +-40 % and 50 % of dynamics; and with 25 %."""

@@ -64,6 +64,7 @@ def test_nothing_uncertain_is_the_norm_of_python_control() -> None:
     assert size <= m.upper <= 1.004 * size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["sensors", "forces"])
 def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     """The flagship anywhere in its travel: 60 machines at corners and within, on a grid of frequencies."""
@@ -126,6 +127,7 @@ def test_radial_sensors_of_the_flagship_have_one_worst_sensitivity() -> None:
         assert found[name].upper == pytest.approx(found["x1"].upper, rel=1e-3)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
 def test_random_loops_stay_below_what_is_proven(seed: int) -> None:
@@ -190,6 +192,7 @@ def test_bad_input_gets_one_sentence(more: dict[str, Any], says: str) -> None:
         malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, **more)
 
 
+@pytest.mark.slow
 def test_a_search_that_missed_the_largest_gain_leads_to_no_bound_below_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -200,6 +203,7 @@ def test_a_search_that_missed_the_largest_gain_leads_to_no_bound_below_it(
     assert T.upper is None or T.upper >= 0.75
 
 
+@pytest.mark.slow
 def test_no_bound_is_proven_of_a_loop_whose_stability_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BlockLoop, "stable", lambda _: False)
     T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary")

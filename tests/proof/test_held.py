@@ -169,6 +169,7 @@ def test_a_ramp_takes_a_force_and_passes_the_readings_at_another_speed() -> None
 # Forces of disturbance
 
 
+@pytest.mark.slow_for("planar-1")
 @pytest.mark.parametrize(("machine", "delay"), [("halbach", 0), ("halbach", 1), ("planar", 1), ("planar", 2)])
 def test_regulator_and_filter_are_stable_by_the_separation_principle(machine: str, delay: int) -> None:
     """The poles of the law on its own model are those of regulator and filter, whatever stands between."""
@@ -190,6 +191,7 @@ def test_regulator_and_filter_are_stable_by_the_separation_principle(machine: st
         assert np.abs(found - pole).min() < 1e-5
 
 
+@pytest.mark.slow_for("planar-50.0")
 @pytest.mark.parametrize(("machine", "push"), [("halbach", 0.3), ("planar", 50.0)])
 def test_a_constant_force_is_taken_off_without_integrals(machine: str, push: float) -> None:
     plant = _plant(machine)
@@ -391,6 +393,7 @@ def test_parameters_that_shape_a_model_have_no_margin() -> None:
 # Simulation
 
 
+@pytest.mark.slow
 def test_a_table_flies_on_the_virtual_machine() -> None:
     """The controller's bilinear table is looked up at every sample; the C engine has no tables and says so."""
     plant, c = _plant("planar"), _controller("planar", 1)
@@ -570,6 +573,7 @@ def test_currents_far_below_their_limit_have_not_met_it() -> None:
     assert run.limits == ()
 
 
+@pytest.mark.slow_for("planar-start1")
 @pytest.mark.parametrize(("machine", "start"), [("halbach", {"x": 1e-4}), ("planar", {"x": 1e-5})])
 def test_an_observer_that_knows_the_start_sees_no_disturbance(machine: str, start: Any) -> None:
     """Off the reference, with a sample of delay: what acted before is what the currents made there."""

@@ -25,6 +25,8 @@ from malta.proof.robust import law_of, problem_of
 from malta.synthesis.riccati import care, dare
 from malta.work import WorkUp, work_limit
 
+pytestmark = pytest.mark.first
+
 Loop = tuple[UncertainSystem, Compensator]
 
 
@@ -227,6 +229,7 @@ def test_wide_chains_are_proven_to_within_a_percent(n: int, T: float | None, t: 
         assert instability(*loop, corner[None])[0] > 0
 
 
+@pytest.mark.slow
 def test_multipliers_that_move_with_frequency_exclude_zero_all_along_it() -> None:
     """F(t) > 0 with N, D and G of every t, and with D and G that stand on a narrower interval alone."""
     s = asked(chain(3, None))
@@ -308,6 +311,7 @@ def test_fourteen_parameters_have_a_bound_in_half_a_minute_and_four_gigabytes() 
     assert stable_within(loop, asked(loop).box, m.lower)
 
 
+@pytest.mark.slow_for("4", "6")
 @pytest.mark.parametrize("count", [2, 4, 6])
 def test_eight_states_over_twelve_decades(count: int) -> None:
     """Four masses of a gram on springs of 1e5 N/m, states counted in units from 1e-6 to 1e6: settled at once."""

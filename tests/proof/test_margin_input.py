@@ -40,6 +40,7 @@ def motor(**options: Any) -> UncertainSystem:
     return malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0}, **options)
 
 
+@pytest.mark.slow_for("-1-exp", "-1-cosh", "1-exp", "1-cosh")
 @pytest.mark.parametrize("f", [ca.exp, ca.sin, ca.cosh])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_functions_that_overflow_far_from_the_axis_are_enclosed_on_smaller_discs(f: Any, sign: int) -> None:
@@ -59,6 +60,7 @@ def test_an_exponential_in_the_input_loses_stability_where_it_does() -> None:
     assert m.lower == pytest.approx(m.upper, rel=1e-3)
 
 
+@pytest.mark.slow_for("sin-a law with states", "sin-a gain", "exp-a gain")
 @pytest.mark.parametrize("law", [LAG, [[-1.0]]], ids=["a law with states", "a gain"])
 @pytest.mark.parametrize("f", [ca.sin, ca.exp])
 def test_functions_in_the_direct_feedthrough_are_enclosed(f: Any, law: Any) -> None:
@@ -88,6 +90,7 @@ def test_ranges_that_overflow_are_refused(value: Any) -> None:
         malta.proof.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": value}, {"k": 1})
 
 
+@pytest.mark.slow_for("20-3", "20-5", "100-2", "100-3", "100-5", "150-1", "150-2", "150-3", "150-5")
 @pytest.mark.parametrize("power", [1, 2, 3, 5])
 @pytest.mark.parametrize("decades", [20, 100, 150])
 def test_numbers_that_overflow_prove_nothing(decades: int, power: int) -> None:
@@ -360,3 +363,13 @@ def test_a_settled_margin_gives_no_reason() -> None:
     assert found.lower is not None
     assert found.lower > 0
     assert found.reason == ""
+
+
+def test_a_law_of_the_other_sign_is_told() -> None:
+    """K of control.lqr is of u = -K x."""
+    cart = malta.uncertain(lambda k: ([[0, 1], [k, 0]], [[0], [2]], [[1, 0], [0, 1]]), {"k": 400.0})
+    K = control.lqr([[0, 1], [400, 0]], [[0], [2]], np.diag([1e6, 1.0]), [[1.0]])[0]
+    found = malta.robust_margin(cart, K, {"k": 0.2})
+    assert found.reason == "the nominal loop is unstable, and stable with -F: u = F y is positive feedback"
+    assert (malta.robust_margin(cart, -K, {"k": 0.2}).lower or 0.0) > 20
+    assert malta.robust_margin(cart, 0 * K, {"k": 0.2}).reason == "the nominal loop is unstable"

@@ -23,6 +23,7 @@ def chain(tau: float, unit: float = 1.0) -> UncertainSystem:
     return malta.uncertain(lambda k: (A, [[0], [0], [k / tau]], [[1, 0, 0]]), {"k": 1.0})
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-9, 9), st.floats(-6, 6))
 def test_time_and_states_have_no_scale(decades: float, unit: float) -> None:
@@ -43,6 +44,7 @@ def test_parameters_have_no_scale(scale: float) -> None:
     assert m.upper == pytest.approx(7, rel=1e-6)
 
 
+@pytest.mark.slow_for("0.1")
 @pytest.mark.parametrize("T", [1e-9, 1e-7, 1e-5, 1e-3, 0.1])
 def test_sampling_faster_and_faster_tends_to_the_continuous_loop(T: float) -> None:
     """Two masses and a spring near 1 rad/s under state feedback, sampled exactly."""
@@ -92,6 +94,7 @@ def test_a_system_need_not_be_of_second_order() -> None:
     assert m.upper == pytest.approx(9, rel=1e-6)
 
 
+@pytest.mark.slow_for("0.01")
 @pytest.mark.parametrize("width", [1.0, 0.01])
 def test_a_narrow_bump_is_enclosed(width: float) -> None:
     """x'' = -x - (1 - 2 e^-((p - 0.7) / width)^2) x': unstable within width sqrt(ln 2) of 0.7."""
@@ -195,6 +198,7 @@ def test_a_statespace_and_affine_matrices_are_taken() -> None:
     assert both[0].lower == pytest.approx(10, rel=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(st.integers(0, 10_000))
 def test_random_loops_are_stable_in_the_proven_box(seed: int) -> None:

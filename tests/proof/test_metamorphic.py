@@ -90,6 +90,7 @@ def weakly_coupled(E: Any, sample_time: float | None) -> tuple[Any, Any]:
     return malta.uncertain(matrices, {"k": 1.0}), law
 
 
+@pytest.mark.slow_for("mass-None", "mass-1.0")
 @pytest.mark.parametrize("sample_time", [None, 1.0])
 @pytest.mark.parametrize(
     "E", [np.eye(4) * 1e9, np.kron(np.eye(2), [[1, 1e3], [0, 1]])], ids=["mass", "mixed"]
@@ -102,6 +103,7 @@ def test_neglected_couplings_carry_the_descriptor(E: Any, sample_time: float | N
     assert found.lower is None or found.lower < 18.5
 
 
+@pytest.mark.slow
 def test_neglected_couplings_carry_denominators() -> None:
     """Lost at 1e-13 k = 1e-12 h, k = 5: rows with denominators are multiplied by them, bounds of couplings too."""
 

@@ -154,6 +154,7 @@ def check(seed: int, names: Any, seconds: float) -> None:
         assert base.lower == pytest.approx(least.lower, rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("seed", [8, 12])
 def test_margins_of_random_loops(seed: int, name: str) -> None:

@@ -17,6 +17,7 @@ def loop() -> malta.loops.Loop:
     return malta.loop(spec.plant, malta.synthesize(spec, model))
 
 
+@pytest.mark.slow
 def test_a_loop_brings_its_law(loop: malta.loops.Loop) -> None:
     ranges = {"m": 0.1, "C": 0.1}
     found = malta.robust_margin(loop, ranges)

@@ -186,6 +186,7 @@ def test_the_published_margin_is_that_of_full_state_feedback(
     assert m.sensitivity["K_B"] == pytest.approx(2 / 3, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_each_parameter_alone_of_full_state_feedback(
     regulators: dict[str, tuple[Plant, Compensator]],
 ) -> None:
@@ -240,6 +241,7 @@ def _machine(
     return machine_system(plant, c, names, {"z": z}, current_loops)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("current_loops", ["lag", "pi"])
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops: Any) -> None:
@@ -321,6 +323,7 @@ def cells_of(
     assert len(s.names) == p.shape[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_certificate_covers_all_frequencies_and_the_whole_box(
     name: str, two_masses: tuple[UncertainSystem, Compensator]
@@ -403,6 +406,7 @@ def test_no_machine_of_a_proven_box_is_unstable(seed: int) -> None:
             assert m.upper / m.lower < 1.01
 
 
+@pytest.mark.slow
 def test_stability_is_lost_inside_a_face() -> None:
     """Least damped in the middle of a side: the corners say nothing, the proof gets stuck there and finds it."""
     for edge in (0.6, -0.25):

@@ -96,6 +96,7 @@ def test_handbook_7_3_3() -> None:
     assert m.frequency == pytest.approx(1.162318, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_vicino_tesi_and_milanese_1990() -> None:
     """Computation of nonconservative stability perturbation bounds, IEEE TAC 35; Handbook 7.3.4: 6.2746."""
     case = cases.VICINO_TESI_MILANESE
@@ -198,6 +199,7 @@ def test_an_island_that_a_side_of_the_box_meets(r: float) -> None:
     bracketed(margin_of(case), case.margin)
 
 
+@pytest.mark.slow_for("0.001")
 @pytest.mark.parametrize("r", [0.5, 0.1, 0.01, 1e-3])
 def test_an_island_that_a_corner_of_the_box_meets(r: float) -> None:
     m = margin(cases.island(r), {"q1": (0, 2), "q2": (0, 2)}, {"q1": 0, "q2": 0})

@@ -31,8 +31,6 @@ from malta.proof.margin import Margin
 from malta.simulation.experiments.catalogue import cases_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from malta.synthesis.controller import Controller
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -42,12 +40,9 @@ DESIGNS = ("rotor", "rotor_pid")
 
 
 @pytest.fixture(scope="module")
-def rotor() -> Iterator[Any]:
-    """The machine's module; other tests do not find it."""
-    yield machine(FOLDER / "rotor.py")
-    del machines._files["rotor"]
-    for name in [name for name in sys.modules if name.startswith(f"{machines.FILES}.rotor")]:
-        del sys.modules[name]
+def rotor() -> Any:
+    """The machine's module."""
+    return machine(FOLDER / "rotor.py")
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +171,7 @@ def test_a_rotor_that_fell_is_caught(plant: Plant, controllers: dict[str, Contro
         malta.experiment("drop", plant, controllers["rotor"], off=0.3)
 
 
+@pytest.mark.slow
 def test_one_proof_covers_every_speed(plant: Plant, controllers: dict[str, Controller], par: Any) -> None:
     c, box = controllers["rotor_pid"], {"k_i": 0.1}
     places, over = travel_loops(plant, c, ("k_i",))
@@ -219,6 +215,7 @@ def agree(
     assert instability(system, law, stretched)[0] > 0
 
 
+@pytest.mark.slow
 def test_words_say_what_a_proof_covers(plant: Plant, controllers: dict[str, Controller]) -> None:
     speed = "for all Omega in 0 .. 2094 rad/s"
     assert str(extent_of(plant)) == speed

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 import malta
 from malta.budget import Budget
 from malta.proof import routes, search
+from malta.proof.box import box_of
+from malta.proof.exclusion.witness import nearest, starts
 from malta.proof.polynomial.enclosure import Unproven
+from malta.proof.robust import problem_of
 from malta.proof.routes import Attempt, Route
 
 BOX = {"m": 0.1, "k": 0.1}
@@ -71,3 +75,23 @@ def test_nothing_is_proven_beside_the_routes(monkeypatch: pytest.MonkeyPatch) ->
     assert found.lower is None
     assert found.upper == pytest.approx(7.5, rel=1e-6)  # the witness is found, not proven
     assert math.isfinite(found.upper)
+
+
+def test_a_loss_in_the_middle_of_an_interval_is_found_from_the_ends_of_one_parameter() -> None:
+    """s^2 + (1 + 5 z^2 - p) s + 1: lost at p = 1 and z = 0, beyond the box at the ends of z."""
+
+    def matrices(p: Any, z: Any) -> Any:
+        return [[0, 1], [-1, p - 1 - 5 * z * z]], [[0], [1]], [[1, 0]]
+
+    system = malta.uncertain(matrices, {"p": 0.5, "z": 0.0})
+    box = box_of(
+        system.names, system.nominal, system.limits, {"p": (0.5, 1.5)}, {"z": (-1.0, 1.0)}, caller="test"
+    )
+    law = malta.proof.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+    (part,) = search.parts_over(problem_of(system, law), box, 1.2, math.inf)
+    t, _, x, u = starts(part.family, part.growth)[0]
+    assert t == pytest.approx(0.5, rel=5e-2)
+    assert u[1] == 0.5
+    zero = nearest(part.family, part.growth, 0, x, u, math.inf)
+    assert zero is not None
+    assert zero.t == pytest.approx(0.5, rel=1e-9)

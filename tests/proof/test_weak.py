@@ -119,6 +119,7 @@ def test_dominating_bounds_every_power() -> None:
         dominating_solution(8 * M, r)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planar", "planar_pid"])
 def test_the_machine_lies_within_its_enclosure(name: str) -> None:
     """Z, E and B of the model at random positions and parameters, beside the bounds over the box and the travel."""
@@ -195,6 +196,7 @@ def test_the_loop_is_what_is_bounded() -> None:
             assert min(abs(phase - z**k) for k in range(-12, 13)) < 2e-5
 
 
+@pytest.mark.slow
 def test_adjugates_and_determinants_of_axes() -> None:
     """The polynomials over a box, at its middle, beside numpy's inverse of z - A0."""
     _, _, problem = machine()
@@ -290,6 +292,7 @@ def test_a_stronger_coupling_proves_less() -> None:
     assert 0.5 * one < ten < 0.99 * one
 
 
+@pytest.mark.slow
 def test_parameters_of_no_such_form_are_left_to_places() -> None:
     """The coil pitch enters through sines of the place of each coil: of that nothing is claimed."""
     controller = gains.read("design/gains/planar.json")

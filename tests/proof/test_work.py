@@ -123,6 +123,13 @@ KINDS: dict[str, Callable[[], Any]] = {
 }
 
 
+@pytest.mark.slow_for(
+    "continuous loop of 14 parameters",
+    "polynomial of 4 parameters",
+    "polynomial of 14 parameters",
+    "functions of parameters",
+    "quotients in every entry",
+)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_search_ends_with_its_work(kind: str) -> None:
     """A last look for a witness may take 0.4 units and a tenth more; one step is not cut in two."""
@@ -164,6 +171,7 @@ def asked(which: str) -> malta.proof.Margin:
     return malta.robust_margin(system, law, box, budget=Budget(0.5, patient=False))
 
 
+@pytest.mark.slow_for("polynomial", "chain", "sampled")
 @pytest.mark.parametrize("which", ["cubic", "polynomial", "chain", "functions", "sampled"])
 def test_a_clock_fifty_times_as_fast_changes_nothing(which: str, hasty: Callable[[float], None]) -> None:
     one = asked(which)
@@ -171,6 +179,7 @@ def test_a_clock_fifty_times_as_fast_changes_nothing(which: str, hasty: Callable
     assert bits(asked(which)) == bits(one)
 
 
+@pytest.mark.slow
 def test_work_does_not_depend_on_earlier_questions() -> None:
     """A wider box and another law were asked before: what is remembered of them counts as if it were done again."""
     system, box = chain(2)
@@ -181,6 +190,7 @@ def test_work_does_not_depend_on_earlier_questions() -> None:
     assert bits(malta.robust_margin(system, [[-0.3]], box, budget=Budget(0.5))) == bits(fresh)
 
 
+@pytest.mark.slow
 def test_a_clock_that_ends_a_search_is_named(hasty: Callable[[float], None]) -> None:
     system, box = chain(4)
     malta.robust_margin(system, SAMPLED, box, budget=Budget(1e-3))
@@ -191,6 +201,7 @@ def test_a_clock_that_ends_a_search_is_named(hasty: Callable[[float], None]) -> 
     assert found.lower is None or found.lower <= found.upper
 
 
+@pytest.mark.slow
 def test_time_that_is_given_is_used() -> None:
     """A tenth of a unit leaves this loop open; rounds that follow decide it, long before the minute is over."""
     system, box = chain(2)
@@ -212,6 +223,7 @@ def test_rounds_follow_as_long_as_the_clock_allows() -> None:
         assert found.lower == pytest.approx(found.upper, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_says_what_it_knows() -> None:
     system, box = chain(2)
     whole = malta.robust_margin(system, [[-0.3]], box)
@@ -295,6 +307,7 @@ def test_a_budget_of_nothing_is_refused(limits: Any) -> None:
         Budget(**limits)
 
 
+@pytest.mark.slow
 def test_an_expansion_that_was_ended_is_begun_again() -> None:
     """Nothing that the end of one search left undone is remembered by the next one."""
     system, box = chain(2)

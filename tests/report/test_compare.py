@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from browsing import browser as browser, open_page
+from browsing import browser as browser, open_page, printed_overlaps
 from conftest import ROOT, Run
 from page_checks import read_page
 from rich.console import Console
@@ -22,15 +22,19 @@ from malta.cli.documents.loops import compare_output
 from malta.margins.verify import linear_report
 from malta.merit_lists import find_best
 from malta.merits import MEANINGS, Merit, figure, four_digits
+from malta.model.linearize import linearize
 from malta.report.page.analysis import Subject
 from malta.report.page.comparison import Comparison, MeritRow, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page
 from malta.report.tables.margins import position_text
+from malta.synthesis.design_file import read_design
+from malta.synthesis.synthesize import synthesize
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 GAINS = ROOT / "design" / "gains"
 
@@ -43,6 +47,12 @@ def subject_of(controller: Controller, source: str = "", **box: float) -> Subjec
 def carts() -> Comparison:
     soft, stiff = cart_controller("soft"), cart_controller("stiff", 2e-5)
     return compare([subject_of(soft), subject_of(stiff)])
+
+
+def test_what_never_settles_is_said_so() -> None:
+    """An accelerometer under a constant load: no time is long enough; a delay margin without end is any."""
+    assert figure("load_settles", "k", "1 N w: within 1 % after", float("inf"), "s").text == "never"
+    assert figure("delay_margin", "k", "delay margin", float("inf")).text == "any"
 
 
 def row_of(found: Comparison, key: str) -> MeritRow:
@@ -75,6 +85,7 @@ def test_figures_are_those_of_verify_and_the_better_is_marked(carts: Comparison)
     assert row_of(carts, "stable").best == (False, False)  # a tie
 
 
+@pytest.mark.slow
 def test_margins_stand_as_bars_where_they_count_in_one_box(carts: Comparison) -> None:
     """As high as the proven margin, in the terminal and on the page; no bars of different uncertainties."""
     proven = [stair.proven for stair in carts.margins]
@@ -172,6 +183,7 @@ def test_the_page_of_a_comparison(carts: Comparison, tmp_path: Path, browser: An
     for width in (1280, 390):
         open_page(browser, out, width=width)
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    assert printed_overlaps(browser, "h1, h2, figure svg, figcaption, table, .caption, p, dt, dd") == []
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
@@ -179,7 +191,10 @@ def test_the_page_of_a_comparison(carts: Comparison, tmp_path: Path, browser: An
 def test_shipped_designs_beside_each_other(run: Run, tmp_path: Path) -> None:
     files = [GAINS / f"{name}.json" for name in ("halbach", "halbach_pid")]
     found = json.loads(run("compare", *files, "--json", "--out", tmp_path / "page.html").out)
-    read_page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    html = (tmp_path / "page.html").read_text(encoding="utf-8")
+    read_page(html)
+    assert "<b>✗ worse than halbach_pid</b>" in html
+    assert ">time [s]<" in html  # 66 s of steps
     figures = {one["key"]: one for one in found["figures"]}
     for k, file in enumerate(files):
         stored = json.loads(file.read_text(encoding="utf-8"))["verification"]
@@ -190,6 +205,45 @@ def test_shipped_designs_beside_each_other(run: Run, tmp_path: Path) -> None:
         assert figures["peak_sensitivity_sigma_max"]["values"][k] == pytest.approx(peak, rel=1e-4)
     assert figures["margin_proven_share"]["best"] == ["halbach"]
     assert {"law_kind", "gains_norm_of_K"} <= set(found["differences"])
+    assert found["specification"].endswith("halbach_pid.toml")
+    first, second = found["standings"]
+    assert (first["design"], first["verdict"]) == ("halbach", "worse than halbach_pid")
+    assert "misses peak sensitivity 1.851, asked <= 1.8" in first["where"]
+    assert second["verdict"].startswith("the reference, holds all 2 requirements")
+
+
+def design_of(name: str, bound: float) -> tuple[Spec, Controller]:
+    """The ball's design, asked for a peak sensitivity, with the gains of its file."""
+    spec = read_design(ROOT / f"examples/ball/design/{name}.toml")
+    asked = replace(spec, specification={"peak_sensitivity": bound, "bandwidth": 240.0})
+    return asked, synthesize(spec, linearize(spec.plant, spec.plant.at()))
+
+
+def test_one_specification_judges_all_designs_and_says_which_is_better_and_where() -> None:
+    """The ball's LQG and PID by bounds of one file: what one of them alone holds makes it the better one."""
+    spec, lqg = design_of("ball", 1.52)
+    _, pid = design_of("ball_pid", 1.52)
+    subjects = [Subject(one, one.parameters, {}, own) for one, own in ((lqg, spec), (pid, None))]
+    found = compare(subjects, proof=False)
+    assert [a.report.requirements[0].asked for a in found.designs] == [1.52, 1.52]
+    peaks = [a.report.requirements[0].found for a in found.designs]
+    assert peaks[1] < 1.52 < peaks[0]
+    assert peaks == [a.report.peak_sensitivity["y"] for a in found.designs]
+    first, second = found.standings
+    assert first.value.startswith("the reference, holds 1 of 2 requirements")
+    assert f"misses peak sensitivity {peaks[0]:.4g}, asked <= 1.52" in first.note
+    assert second.value == "better than ball"
+    assert text_of(found, 80).startswith("ball: the reference")
+    other = compare(subjects[::-1], proof=False, spec=spec)
+    assert [one.value.partition(",")[0] for one in other.standings] == ["better than ball", "the reference"]
+    assert (other.reference, other.judged_text) == (1, "")
+
+
+def test_a_specification_of_another_machine_judges_nothing(run: Run) -> None:
+    files = [GAINS / f"{name}.json" for name in ("halbach", "halbach_pid")]
+    said = run("compare", *files, "--no-proof", "--specification", ROOT / "design" / "robust.toml")
+    assert (said.code, said.out) == (2, "")
+    assert "--specification: machine: found tubular, expected that of all gain files" in said.err
 
 
 @pytest.mark.slow
@@ -200,6 +254,7 @@ def test_different_machines_are_compared_in_what_they_share(run: Run) -> None:
     assert {"stable", "disk_margin_forces", "peak_sensitivity"} <= keys
     assert not any(key.startswith(("motion", "load", "stroke", "requirement")) for key in keys)
     assert any("machines differ (planar, halbach)" in remark for remark in found["remarks"])
+    assert not any(one["best"] for one in found["figures"])
 
 
 @pytest.mark.slow

@@ -110,6 +110,7 @@ def run_of(name: str) -> Experiment:
     return Experiment("run", "A run", (Case("a", run, ()),), ())
 
 
+@pytest.mark.slow_for("calibrated", "halbach")
 @pytest.mark.parametrize("name", ["calibrated", "halbach", pytest.param("planar", marks=pytest.mark.slow)])
 def test_a_run_is_drawn_with_every_input_and_output(name: str) -> None:
     figure = report.experiment_figure(run_of(name))
@@ -206,6 +207,7 @@ def test_nothing_is_wrong_with_the_figures_of_machines_of_ones_own(name: str) ->
     assert defects(report.recovery_figure(spec.plant, c)) == []
 
 
+@pytest.mark.slow_for("pdf")
 @pytest.mark.parametrize("end", ["png", "svg", "pdf"])
 def test_a_dollar_in_a_name_begins_no_formula(end: str) -> None:
     r"""Names of signals come from files: `a$x_{$` is no TeX, and `\frac` is not read."""

@@ -8,7 +8,8 @@ import pytest
 from conftest import ROOT, Run
 
 from malta.errors import InputError
-from malta.report.ledger import Ledger, LedgerClaim, find_tables, replace_tables
+from malta.report.ledger import Ledger, LedgerClaim
+from malta_papers.ledger import find_tables, replace_tables
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -89,8 +90,8 @@ def test_a_title_is_of_the_second_or_third_order() -> None:
 
 @pytest.mark.slow
 def test_the_command_writes_the_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("malta.machines.tubular.paper.quantities.MACHINES", 16)
-    monkeypatch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", 2)
+    monkeypatch.setattr("malta_papers.tubular.quantities.MACHINES", 16)
+    monkeypatch.setattr("malta_papers.tubular.quantities.LEARNERS", 2)
     file = tmp_path / "claims.md"
     head = TEXT[: TEXT.index("### halbach")].replace("`b` | `a`", "`table2`")
     file.write_text(head, encoding="utf-8")

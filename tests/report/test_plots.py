@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,9 @@ from malta.loops.locus import root_locus
 from malta.margins.margin_map import margin_map_of
 from malta.model.signal_groups import axis_units
 from malta.report.plots.plane import Window, branch_paths
+from malta.synthesis.curve_limits import curve_limits
+from malta.synthesis.recovery import RecoveryBound
+from malta.tuning.judging import judge
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,6 +74,7 @@ def near(axes: Axes, x: float, y: float, rel: float = 1e-3) -> bool:
     return any(np.allclose(point, (x, y), rtol=rel, atol=rel) for xy in short for point in xy)
 
 
+@pytest.mark.slow_for("bode", "sigma", "sensitivity_curves", "gang_of_four")
 @pytest.mark.parametrize("draw", PLOTS, ids=lambda draw: draw.__name__)
 def test_plots_of_stable_and_unstable_loops_have_no_defects(draw: Any, unstable: dict[str, Any]) -> None:
     figure = draw(unstable)
@@ -94,6 +99,7 @@ def test_loads_are_drawn_without_defects(robust: LoopCurves) -> None:
     assert len(figure.axes) == 2 * 5  # T_z turns the mover about its axis, which no output reads
 
 
+@pytest.mark.slow
 def test_names_are_drawn_as_they_are() -> None:
     """No formula of $, no markup; names of any length leave room."""
     names = ["$a_1$ <b>", "ε" * 70, "c", "d", "e"]
@@ -135,6 +141,7 @@ def test_the_circle_of_the_peak_touches_the_nyquist_curve() -> None:
     assert np.abs(value + 1).min() >= radius - 1e-6
 
 
+@pytest.mark.slow
 def test_a_channel_and_axes_may_be_chosen(robust: LoopCurves) -> None:
     figure = Figure()
     axes = figure.subplots(2, 2)
@@ -177,12 +184,16 @@ def test_a_margin_map_has_powers_of_ten_with_the_unit() -> None:
     controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     figure = report.margin_map(margin_map_of(spec.plant, controller, ("m", "C"), {"m": 0.2, "C": 0.2}))
     (panel,) = figure.axes
-    assert (panel.get_xlabel(), panel.get_ylabel()) == ("m [kg]", "C [1e-6 N m^2/A^2]")
+    assert (panel.get_xlabel(), panel.get_ylabel()) == (
+        "mass of the sphere m [kg]",
+        "magnet constant C [1e-6 N m^2/A^2]",
+    )
     figure.canvas.draw()
     assert panel.yaxis.get_offset_text().get_text() == ""
     assert "20" in [text.get_text() for text in panel.get_yticklabels()]
 
 
+@pytest.mark.slow
 def test_a_margin_map_proves_no_unstable_machine_and_meets_its_witness() -> None:
     """Two routes: no eigenvalue in the proven box is unstable, and the witness lies on the boundary that they show."""
     controller = malta.gains.read(GAINS / "halbach.json")
@@ -237,6 +248,7 @@ def test_plots_show_themselves_in_notebooks(unstable: dict[str, Any]) -> None:
 # --- malta plot ---
 
 
+@pytest.mark.slow
 def test_the_command_writes_pictures_and_numbers(tmp_path: Path, run: Run) -> None:
     gains = str(GAINS / "halbach.json")
     said = run(
@@ -297,6 +309,7 @@ def test_bad_input_is_one_sentence(arguments: list[str], message: str, run: Run)
     assert not said.out
 
 
+@pytest.mark.slow
 def test_an_unstable_loop_is_drawn_and_named(tmp_path: Path, run: Run) -> None:
     said = run(
         "plot", str(GAINS / "robust.json"), "step", "--channel", "z", "--set", "m=5.2", "--out", str(tmp_path / "a.png")
@@ -331,3 +344,70 @@ def test_a_constant_gain_is_a_straight_line() -> None:
 )
 def test_axes_of_any_unit_have_a_compliance(output: str, force: str, found: tuple[str, str, bool]) -> None:
     assert axis_units(output, force) == found
+
+
+@pytest.mark.parametrize("bound", [1.5, 1.65])
+def test_a_region_is_hatched_where_the_judge_fails(bound: float) -> None:
+    """Bounds of the ball's design on either side of what it has: |S|, its disk about -1, T and a load's deviation."""
+    spec = malta.read_design(ROOT / "examples" / "ball" / "design" / "ball.toml")
+    controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    curves = loop_curves(spec.plant, controller)
+    load = RecoveryBound("w largest", (1.0,), (0.0,), None, False, ("y",), "m", 220e-6 * bound)
+    asked = {"peak_sensitivity": bound, "bandwidth": 240.0 * bound / 1.5, "recovery w largest": load.limit}
+    named = replace(spec, specification=asked, recovery={"w largest": load})
+    verdicts = {one.name: one.verdict for one in judge(named, controller)}
+    limits = curve_limits(named)
+    assert [one.curve for one in limits] == ["S", "T", "load"]
+    for draw, entry in ((report.sensitivity_curves, "peak_sensitivity"), (report.nyquist, "peak_sensitivity"),
+                        (report.load_response, "recovery w largest")):  # fmt: skip
+        figure = draw(curves, limits=limits)
+        drawn: list[Any] = [one for panel in figure.axes for one in (*panel.collections, *panel.patches)]
+        regions = [one for one in drawn if one.get_hatch()]
+        assert bool(regions) == (verdicts[entry] == "fails"), (draw, entry)
+        word = "FAILS" if regions else "asked"
+        words = next(one.words for one in limits if one.entry == entry)
+        assert f"{words} {word}" in texts_of(figure)
+    assert {verdicts["peak_sensitivity"], verdicts["recovery w largest"]} == {
+        "holds" if bound > 1.6 else "fails"
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        (
+            "robust",
+            [
+                "every 50 µs, 20 kHz",
+                "delay 75 µs",
+                "PI to 477 Hz",
+                "|v| ≤ 52 N",
+                "Kalman filter",
+                "15 states",
+            ],
+        ),
+        (
+            "halbach_pid",
+            ["every 55 ms, 18.2 Hz", "delay 27.5 ms", "filters of rates", "|v| ≤ 2 N", "noise 0.12 µm"],
+        ),
+        ("planar", ["every 200 µs, 5 kHz", "delay 1 sample"]),
+    ],
+)
+def test_a_block_diagram_has_the_blocks_of_its_loop(name: str, known: list[str]) -> None:
+    """Rates, delays, limits and noise are those of the gain file and its machine; every text is inside of its block."""
+    controller = malta.gains.read(GAINS / f"{name}.json")
+    figure = report.block_diagram(controller, malta.plant_of(controller.parameters))
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    texts = [text.get_text() for text in axes.texts]
+    assert [text for text in known if text not in texts] == []
+    frames = [patch.get_window_extent() for patch in axes.patches]
+    assert len(frames) == 6
+    for text in axes.texts:
+        box = text.get_window_extent()
+        middle = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
+        for frame in frames:
+            if frame.contains(*middle):
+                assert frame.x0 < box.x0
+                assert box.x1 < frame.x1
+                assert frame.y0 < box.y0

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from conftest import DESIGNS, assert_folds, printed
 from figure_checks import defects
+from flight import EXPERIMENTS
 from rich.console import Console
 
 import malta
 from malta import report
 from malta.display import micro
-from malta.machines.tubular.experiments import EXPERIMENTS
 from malta.report import figures
 from malta.report.ledger import Ledger, LedgerClaim
 from malta.simulation.experiments import Case, Experiment, Merit
@@ -96,6 +96,7 @@ def words(figure: Figure) -> list[str]:
     return [text.get_text() for axes in figure.axes for text in axes.texts]
 
 
+@pytest.mark.slow
 def test_the_page_of_a_design_fits_and_names_its_figures(
     design: Design, flown: Flown, published: dict[str, Any]
 ) -> None:
@@ -152,6 +153,7 @@ def test_the_stroke_figure_has_labelled_axes_and_the_published_bounds(
     assert not any(levels(axes) for axes in coarse.axes)
 
 
+@pytest.mark.slow
 def test_the_stroke_figure_reads_currents_as_thrust(design: Design, tmp_path: Path) -> None:
     """Two modules of 5.2 N/A each, as Fig. 12(d)."""
     run = malta.simulate(design.plant, design.controller, Scenario.stroke())
@@ -175,6 +177,7 @@ def test_a_figure_of_a_failed_run_says_so(designs: dict[str, Design]) -> None:
     assert low < -5 < 5 < high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 def test_the_same_figure_gives_the_same_bytes(design: Design, tmp_path: Path, suffix: str) -> None:
     run = malta.simulate(design.plant, design.controller, Scenario.stroke())
@@ -192,6 +195,7 @@ def test_unknown_kinds_of_figures_are_refused(design: Design, tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_stroke_is_drawn_whole_and_saved_only_where_a_path_is_given(
     designs: dict[str, Design], published: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -255,6 +259,7 @@ QUICK = [name for name in EXPERIMENTS if name not in LONG]
 FLOWN = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in EXPERIMENTS if name in LONG)]
 
 
+@pytest.mark.slow_for("stroke", "hold", "tilt", "payload", "disturbance", "faults", "drive-limits", "carrier")
 @pytest.mark.parametrize("name", QUICK)
 def test_nothing_in_a_figure_overlaps_or_is_cut_off(name: str, pictured: Pictured) -> None:
     """Panels, axis labels, titles and legends: none lies on another, none leaves the page. See test_figures, too."""
@@ -282,6 +287,7 @@ def test_nothing_in_a_figure_overlaps_or_is_cut_off(name: str, pictured: Picture
             assert min(wide, high) < 2, f"{what} lies on {that}"
 
 
+@pytest.mark.slow
 def test_figures_hold_what_the_paper_prints(flown: Flown, published: dict[str, Any]) -> None:
     def of(name: str) -> Figure:
         return report.experiment_figure(flown("calibrated", name), published)
@@ -352,6 +358,7 @@ def test_touchdowns_are_marked(flown: Flown, published: dict[str, Any]) -> None:
     assert {"touchdown", "axial end stop"} <= set(marked)
 
 
+@pytest.mark.slow_for("stroke", "hold", "tilt", "payload", "disturbance", "faults", "carrier")
 @pytest.mark.parametrize("name", [one for one in FLOWN if one != "drive-limits"])
 def test_runs_that_end_early_are_drawn(
     name: str, designs: dict[str, Design], published: dict[str, Any], tmp_path: Path
@@ -367,6 +374,7 @@ def test_runs_that_end_early_are_drawn(
     printed(report.experiment_table(e, published))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_has_touched_nothing(flown: Flown, tmp_path: Path) -> None:
     e = flown("calibrated", "payload")
     broken = replace(e.run, verdict=Verdict("interrupted", float(e.run.t[-1])))
@@ -395,6 +403,7 @@ def test_long_lines_keep_their_peaks(flown: Flown) -> None:
     assert (y.min(), y.max(), y[-1]) == (whole.min(), whole.max(), whole[-1])
 
 
+@pytest.mark.slow
 def test_experiments_are_saved_where_a_path_is_given(
     flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,9 +9,10 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import control
 import numpy as np
 import pytest
-from browsing import browser as browser, open_page, printed
+from browsing import browser as browser, open_page, printed, printed_overlaps
 from conftest import ROOT, Run
 from page_checks import cells_of, read_page
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from malta.report.page.analysis import Analysis
     from malta.synthesis.controller import Controller
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 HOSTILE = '<script>alert("x")</script>$a_b$\\frac{\x0b'
 # of a letter in a figure and of the page, as "rgb(0, 0, 0)"
@@ -178,6 +179,36 @@ def test_a_figure_answers_under_the_pointer(tmp_path: Path, browser: Any) -> Non
     assert "1 2" in " ".join(text.split())  # on paper no table is folded
 
 
+AT_VALUE = """
+const [re, im] = arguments, svg = document.querySelector("figure svg");
+const a = JSON.parse(document.getElementById("panels-of-figures").textContent)[0].axes[0], m = svg.getScreenCTM();
+const share = (v, {low, high}) => (v - low) / (high - low);
+const p = new DOMPoint(a.left + share(re, a.x) * (a.right - a.left), a.bottom + share(im, a.y) * (a.top - a.bottom));
+const at = p.matrixTransform(m);
+svg.dispatchEvent(new PointerEvent("pointermove", {clientX: at.x, clientY: at.y, bubbles: true}));
+const readout = document.querySelector(".readout");
+return readout.hidden ? "" : readout.innerText.replaceAll("−", "-");
+"""
+
+
+@pytest.mark.slow
+def test_a_nyquist_plot_tells_the_frequency_under_the_pointer(tmp_path: Path, browser: Any) -> None:
+    """Of L = 4 / (s (s + 1) (s + 2)); the unit circle is no data."""
+    s, w = control.tf("s"), 1.1
+    loop = 4 / (s * (s + 1) * (s + 2))
+    page = render(
+        Front("a", "b", "c"), [Section("x", "X", (Illustration(lambda: malta.report.nyquist(loop), "L"),))]
+    )
+    open_page(browser, page.save(tmp_path / "page.html"))
+    value = complex(loop(1j * w))
+    told = browser.execute_script(AT_VALUE, value.real, value.imag)
+    found = re.search(r" at ([\d.]+) rad/s \(([\d.]+) Hz\)", told)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(w, rel=0.05)
+    assert float(found[2]) == pytest.approx(float(found[1]) / (2 * np.pi), rel=1e-3)
+    assert browser.execute_script(AT_VALUE, 0.8, 0.6) == ""  # on the unit circle, far from the curve
+
+
 @pytest.mark.slow
 def test_the_same_controller_gives_the_same_bytes(cart: Analysis, page: Page) -> None:
     assert page_of(cart).content == page.content
@@ -243,6 +274,12 @@ def test_the_report_of_a_shipped_design_on_screens_and_paper(tmp_path: Path, bro
             assert max(away) > 500
             assert min(away) > 200  # notes are grey
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+    assert (
+        printed_overlaps(
+            browser, "h1, h2, svg.machine, figure svg, figcaption, table, .caption, p, .key div, dt, dd"
+        )
+        == []
+    )
     sheet = pypdf.PdfReader(io.BytesIO(printed(browser)))
     text = " ".join(" ".join(one.extract_text().split()) for one in sheet.pages)
     peak = max(row[1] for row in cells_of(html, "Gang of four")[1:])
@@ -333,3 +370,22 @@ def test_an_uncertainty_is_read_as_verify_reads_it(texts: list[str] | None, box:
     assert dict(read_subject(path, malta.gains.read(path), None, texts, None).box) == box
     with pytest.raises(malta.InputError, match="a share above 0 %"):
         read_subject(path, malta.gains.read(path), None, ["m=0%"], None)
+
+
+@pytest.mark.slow
+def test_a_page_says_which_loads_of_any_waveform_touch_nothing() -> None:
+    """The figures of malta.margins.load_limits, on the first screen, in the loads' section and among the figures."""
+    spec = malta.read_design("examples/ball/design/ball.toml")
+    controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    found = analyse(Subject(controller, controller.parameters))
+    (limit,) = malta.margins.load_limits(malta.loop(spec.plant, controller))
+    size = f"{limit.proven.text()} N"
+    shown = {figure.label: figure.value for figure in key_figures(found)}
+    assert shown["Any load, touching nothing"] == f"{limit.proven.text(3)} N"
+    assert {one.identifier: one.value for one in found.figures}["load_w_safe_N"] == limit.safe.limit
+    html = page_of(found).html
+    (row,) = [row for row in cells_of(html, "Any load of at most this size")[1:] if row[0] == "w"]
+    assert row[1] == size
+    assert "Left out: induced voltages, voltage limits and the DC link" in html
+    assert "The largest share of a clearance that any waveform of a load uses" in html
+    assert analyse(Subject(controller, controller.parameters), proof=False).loads == ()

@@ -21,23 +21,24 @@ from rich.console import Console
 import malta
 from malta.app.picture import margin_document
 from malta.bound import at_least, at_most
-from malta.cli.identification import _proven_contraction
 from malta.cli.output import _bounds_text
+from malta.cli.stroke_learning import _proven_contraction
 from malta.firmware import export
 from malta.firmware.signals import Target
-from malta.margins.loop_report import ChainStage, LoopReport, Outcome, TravelPlace
+from malta.margins.loop_report import ChainStage, LoopReport, TravelPlace
 from malta.margins.margin_map import MarginMap
+from malta.margins.outcome import Outcome
 from malta.proof.blocks.gain import Gain
 from malta.proof.loss import RayBound
 from malta.proof.margin import NOT_PROVEN, Margin
 from malta.proof.rates import RateBound
 from malta.report.figures.margins import chain_figure
-from malta.report.ledger import Row, claim_of
 from malta.report.tables.design import front_markdown, requirements_table
 from malta.report.tables.margins import loop_tables, open_bounds, worst_case_table
 from malta.report.verdict import verdict_html, verdict_lines, verdict_text
 from malta.structured import Tuned
 from malta.synthesis.spec import Spec
+from malta_papers.ledger import Row, claim_of
 
 VALUES = (0.9962, 0.99999, 1.00001, 3.4999, math.inf, None)
 HALF = 0.5  # range of a parameter: a change that is proven is half of the margin
@@ -122,7 +123,7 @@ def map_of(lower: float | None) -> MarginMap:
     ends = np.array([0.5, 1.5])
     return MarginMap(
         "ball", "m", "C", ("kg", "1"), (1.0, 1.0), (0.2, 0.2), ends, ends, -np.ones((2, 2)), margin_of(lower), ("k",),
-        "box", "",
+        "box", "", ("m", "C"),
     )  # fmt: skip
 
 
@@ -185,7 +186,7 @@ def certificate_text(lower: float | None) -> str:
     from flint import fmpq
 
     from malta.checker.file import StabilityClaim
-    from malta.report.tables.design import claim_share
+    from malta.report.tables.certificate import claim_share
 
     share = 0.0 if lower is None or math.isinf(lower) else lower
     return claim_share(StabilityClaim(fmpq(*share.as_integer_ratio()), None, None, None, ()))
@@ -316,7 +317,8 @@ def test_nothing_else_writes_a_bound() -> None:
     contradiction = {"{lower:.9g}", "{upper:.9g}"}  # of two bounds, which no reader takes for proven
     found = {
         f"{path.relative_to(ROOT)}:{line}": text
-        for path in sorted((ROOT / "malta").rglob("*.py"))
+        for folder in ("malta", "papers")
+        for path in sorted((ROOT / folder).rglob("*.py"))
         for line, text in formatted(path)
         if text not in contradiction
     }

@@ -75,6 +75,7 @@ def deviations(run: Trajectory) -> dict[str, float]:
 # What it takes off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planar", "planar_pid"])
 def test_angles_of_the_step_are_those_of_the_hold_alone(pairs: dict[str, Pair], name: str) -> None:
     """phi 0.81 -> 0.009 urad, theta 0.18 -> 0.003, psi 0.14 -> 0.002: what is left is the hold of 200 us."""
@@ -91,6 +92,7 @@ def test_angles_of_the_step_are_those_of_the_hold_alone(pairs: dict[str, Pair], 
     assert ahead["z"] < 1.01 * usual["z"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [1.0, 2.0])
 def test_half_a_sample_more_or_less_is_twenty_times_as_much(pairs: dict[str, Pair], samples: float) -> None:
     """The lead is a sample of computation and half a hold; nothing is tuned."""
@@ -101,6 +103,7 @@ def test_half_a_sample_more_or_less_is_twenty_times_as_much(pairs: dict[str, Pai
     assert deviations(fly_steps(p, replace(p.ahead, commutation=other)))["phi"] > 20 * 0.0089
 
 
+@pytest.mark.slow
 def test_the_filter_has_to_know(pairs: dict[str, Pair]) -> None:
     """Without `pull` the filter takes the missing force for a disturbance: phi 0.11 urad, twelve times as much."""
     p = pairs["planar"]
@@ -149,6 +152,7 @@ def test_the_loop_is_the_same(pairs: dict[str, Pair], name: str) -> None:
     np.testing.assert_array_equal(loops[0].closed, loops[1].closed)
 
 
+@pytest.mark.slow_for("planar")
 @pytest.mark.parametrize("name", ["planar", "halbach"])
 def test_flights_at_rest_are_the_same(pairs: dict[str, Pair], name: str) -> None:
     """Noise and a force from outside, no bit changes: the loop that flies is the one that is proven."""
@@ -236,6 +240,7 @@ def test_a_machine_whose_currents_know_no_place_is_refused(tmp_path: Path) -> No
     assert "do not depend on where it is" in str(error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".json", ".npz", ".mat"])
 def test_gain_files_hold_it(tmp_path: Path, pairs: dict[str, Pair], suffix: str) -> None:
     """Version 2, with lead and pull; files without it keep version 1 and their bytes."""

@@ -13,19 +13,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 import pytest
+from flight import EXPERIMENTS
 from scipy import stats
 from scipy.linalg import expm
 
 import malta
 from malta import references
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.machines.tubular.experiments import (
-    EXPERIMENTS,
-    disturbances as forces,
-    disturbances as rest,
-    lifting,
-    strokes,
-)
+from malta.machines.tubular.experiments import disturbances as forces, disturbances as rest, lifting, strokes
 from malta.model.plants import plant_of
 from malta.model.printed import published_value
 from malta.simulation.experiments import Case, Experiment, Merit, compliance
@@ -34,6 +29,9 @@ from malta.simulation.scenario import ESTIMATORS, Fault, Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.regulators import lqr
+from malta_papers.tubular.experiments import induced_per_speed
+
+pytestmark = pytest.mark.first
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -100,6 +98,7 @@ def test_defaults_are_the_published_figures(plant: Plant, published: dict[str, A
     assert published["table_III"]["samples"] == rest.REST_SAMPLES
 
 
+@pytest.mark.slow_for("payload", "thermal")
 @pytest.mark.parametrize("name", ["stroke", "hold", "tilt", "payload", "thermal"])
 def test_what_a_merit_is_compared_with_is_in_the_published_data(
     flown: Flown, published: dict[str, Any], name: str
@@ -291,7 +290,7 @@ def test_means_are_within_their_standard_errors(design: Design, flown: Flown, re
 
 def test_the_true_motion_is_the_linear_loops(design: Design, flown: Flown, rests: dict[str, Rest]) -> None:
     names = [s.name for s in design.plant.outputs]
-    runs = [flown(design.spec.name, "hold", seed=seed, fidelity="force") for seed in range(8)]
+    runs = [flown(design.spec.name, "hold", seed=seed, fidelity="force") for seed in range(16)]
     found = [[_merit(run.merits, f"true {name}, rms") for name in names] for run in runs]
     rms = np.sqrt(np.mean(np.square(found), axis=0))
     near = (
@@ -500,6 +499,15 @@ def _pushed(
     return trace
 
 
+@pytest.mark.slow_for(
+    "table2-0.05",
+    "table2-0.1",
+    "table2-0.15",
+    "table2-0.2",
+    "calibrated-0.05",
+    "calibrated-0.1",
+    "calibrated-0.15",
+)
 @pytest.mark.parametrize("extra", [0.05, 0.1, 0.15, 0.2])
 def test_a_picked_mass_sags_as_the_linear_loop_predicts(design: Design, flown: Flown, extra: float) -> None:
     """The weight of the mass as a step of force on the heavier mover, at z = -5 mm where it is picked."""
@@ -536,6 +544,7 @@ def test_what_is_carried(design: Design, flown: Flown) -> None:
             assert 0.06 < case.run.verdict.time < 0.09
 
 
+@pytest.mark.slow_for("table2")
 def test_a_known_mass_hardly_sags_and_does_not_overshoot(design: Design) -> None:
     """Weight and inertia are fed forward: 0.2 kg sag by 142 um with `calibrated` and overshoot by 14 % unknown."""
     plant, controller = design.plant, design.controller
@@ -633,6 +642,7 @@ def test_the_lag_grows_with_the_speed(flown: Flown) -> None:
 # Disturbance
 
 
+@pytest.mark.slow_for("table2")
 def test_simulated_sines_are_on_the_compliance_curve(design: Design, flown: Flown) -> None:
     """With windings, link and current controllers, which the linear loop has as well, to 0.1 %."""
     found = flown(design.spec.name, "disturbance")
@@ -681,6 +691,7 @@ def test_the_largest_compliance_is_on_the_curve(design: Design, flown: Flown) ->
     assert worst == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 def test_steps_are_the_linear_loops(design: Design, flown: Flown) -> None:
     case = flown(design.spec.name, "disturbance", **LINEAR).cases[0]
     assert case.label == "step of 1 N F_x"
@@ -768,6 +779,7 @@ ENDS = {
 }
 
 
+@pytest.mark.slow_for("table2")
 def test_what_survives_a_hold(design: Design, flown: Flown) -> None:
     """At rest the mover needs little of its sensors and of its link for a few milliseconds.
 
@@ -814,6 +826,7 @@ def test_before_it_strikes_a_fault_is_not_there(design: Design, flown: Flown) ->
         assert not np.array_equal(run.x[STRUCK + 1 :], other.x[STRUCK + 1 :]), case.label
 
 
+@pytest.mark.slow
 def test_a_biased_sensor_moves_the_mover_as_the_linear_loop_does(design: Design, flown: Flown) -> None:
     """50 um too much in y1. Where the integrals are quick, y1 goes where the sensor shows zero, and y2 stays; without
     them, table2 makes eight times the bias of it."""
@@ -962,7 +975,7 @@ def test_limit_merits_are_not_compared_with_the_paper(flown: Flown) -> None:
 
 
 def test_induced_voltage_per_speed_is_the_machines(plant: Plant, par: Any) -> None:
-    assert strokes.induced_per_speed(plant) == pytest.approx(par.K_ind, rel=1e-12)
+    assert induced_per_speed(plant) == pytest.approx(par.K_ind, rel=1e-12)
 
 
 # By name
@@ -1032,6 +1045,7 @@ def test_every_experiment_bears_its_name_and_tells_its_progress(designs: dict[st
         assert shares[0] > 0
 
 
+@pytest.mark.slow
 def test_options_reach_every_run(flown: Flown) -> None:
     for name in ("stroke", "hold", "tilt", "payload", "disturbance"):
         found = flown("calibrated", name, seed=5, fidelity="force")
@@ -1077,6 +1091,7 @@ class _Stop:
             raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_was_computed(
     designs: dict[str, Design], flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:

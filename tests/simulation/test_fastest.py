@@ -130,6 +130,7 @@ def test_shooting_on_switching_times_takes_as_long(par: tubular.Parameters, dist
     assert ideal < real < 1.005 * ideal  # what the controllers' period costs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [10e-6, 50e-6, 400e-6])
 def test_without_resistance_the_closed_form(smooth: Plant, period: float) -> None:
     plant = with_actuator(smooth, R=0.0, sample_time=period)
@@ -303,6 +304,7 @@ def test_the_sigmoid_without_cogging_is_the_closed_form(smooth: Plant, par: tubu
     assert (back.rise, back.voltage) == pytest.approx((sigmoid.rise, sigmoid.voltage), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_sigmoid_is_told_when_the_voltage_is_short(plant: Plant, par: tubular.Parameters) -> None:
     with pytest.raises(malta.CheckError, match=r"takes 12\.8 V, more than 11\.2 V"):
         sigmoid_at_peak_current(plant, DISTANCE, par.K_ind, voltage_share=0.5)
@@ -339,6 +341,7 @@ def test_meshes_shares_and_axes_are_refused(plant: Plant, stroke: FastestStroke)
         fastest_stroke(replace(plant, stroke=replace(plant.stroke, name="x", thrust="fx_B1")), 1e-4, 0.0)
 
 
+@pytest.mark.slow
 def test_an_answer_that_fails_its_check_is_none(
     plant: Plant, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

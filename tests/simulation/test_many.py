@@ -102,6 +102,7 @@ def _same(a: Batch, b: Batch, chosen: Any = slice(None), tolerance: float = 0.0)
         np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * size, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", FIDELITIES)
 def test_each_run_is_what_simulate_makes_of_it(calibrated: Design, fidelity: Fidelity) -> None:
     """Eleven machines, no multiple of the eight that share a register, with noise: deviation, rise, overshoot, force,
@@ -149,6 +150,7 @@ def test_workers_do_not_matter(calibrated: Design) -> None:
     assert all(0 < share <= 1 for share in told)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.data())
 def test_company_does_not_matter(calibrated: Design, data: st.DataObject) -> None:
@@ -229,7 +231,7 @@ def test_runs_that_end_in_no_numbers_are_not_completed(calibrated: Design) -> No
     """Attraction beyond all bounds, clearance too: NaN in one lane, and its neighbours fly on."""
     endless = malta.plant_of(replace(calibrated.spec.parameters, r_max=1e300, z_max=1e300))
     changes = {"K_A": np.array([8626.7, 1e14, 8626.7])}
-    scenario = replace(_hold(0.02, fidelity="force", start={"y": 1e-6}), disturbance=None)
+    scenario = replace(_hold(0.02, fidelity="force", start={"y": 1e-6}), disturbance=None, substeps=4)
     batch = simulate_many(endless, calibrated.controller, scenario, changes)
     assert batch.completed.tolist() == [1, 0, 1]
     assert 0 < batch.duration[1] < 0.02
@@ -240,6 +242,7 @@ def test_runs_that_end_in_no_numbers_are_not_completed(calibrated: Design) -> No
     assert np.array_equal(batch.deviation[0], batch.deviation[2])
 
 
+@pytest.mark.slow
 def test_each_run_has_its_own_sensor_errors(calibrated: Design) -> None:
     """Gains, an offset and Hall sensors that differ from run to run, over the scenario's; without changes too."""
     rng = np.random.default_rng(7)
@@ -273,6 +276,7 @@ def test_each_run_has_its_own_sensor_errors(calibrated: Design) -> None:
         many(changes, sensor_errors={"gain_x1": np.zeros(8)})
 
 
+@pytest.mark.slow
 def test_how_a_lift_off_ends(calibrated: Design) -> None:
     """Too little current to lift it in two of three runs, named as the single run names it."""
     scenario = Scenario(
@@ -368,6 +372,7 @@ def test_a_lift_off_is_a_scenario_for_many(calibrated: Design) -> None:
     assert all(run.verdict.completed for run in runs)
 
 
+@pytest.mark.slow
 def test_parts_of_a_run_have_the_noise_of_other_runs(calibrated: Design) -> None:
     """One run's noise in all parts is that run's; other noise in the last third changes nothing before it."""
     changes, scenario = _spread(calibrated, 3), _stroke(fidelity="force", seed=3)
@@ -429,6 +434,7 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         memory.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stroke", "hold", "touchdown"])
 def test_without_a_compiler_the_batch_is_the_same(
     designs: dict[str, Design], request: pytest.FixtureRequest, kind: str

@@ -55,6 +55,7 @@ def test_what_is_held_may_be_carried() -> None:
     assert flown_payload(plant_of(c.parameters), c, 0.05) == (0.05, math.inf)
 
 
+@pytest.mark.slow
 def test_machines_without_an_experiment_of_it() -> None:
     """The planar motor's lift is limited; the Halbach motor's table carries the weight."""
     c = gains.read("design/gains/planar.json")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from malta.simulation.engine import engines
-from malta.simulation.engine.sample_loops import SAMPLES_AT_ONCE, Loop, loop_of
+from malta.simulation.engine.sample_loops import SAMPLES_AT_ONCE, SampleLoop, loop_of
 
 
-def damped() -> Loop:
+def damped() -> SampleLoop:
     """x+ = a (x + (0, u)) turned by sin(x), with a row of x and u^2."""
     x, u, v, a = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("v"), ca.SX.sym("a")
     after = ca.vertcat(a * x[1], ca.sin(x[0]) + u - v)
@@ -33,3 +33,5 @@ def test_rows_are_those_of_a_plain_loop(
     found = damped()(first, [u[:, :1], u[:, 1:]], np.array([0.5]))
     assert np.abs(found - rows).max() < 1e-12
     assert first.tolist() == [0.1, -0.2]
+    assert damped()(first, [u[:, :1], u[:, 1:]], np.array([0.5]), first) == pytest.approx(np.array(rows))
+    assert first == pytest.approx(x, abs=1e-12)

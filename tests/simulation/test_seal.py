@@ -170,6 +170,7 @@ def test_blocks_of_equal_machines_do_not_change_places(controller: Controller, t
     _assert_flown_again((first, files), tmp_path, block_name(0))
 
 
+@pytest.mark.slow
 def test_changed_outcomes_are_named_and_not_reported(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +244,7 @@ def test_a_module_that_decides_runs_changes_the_revision(
     assert identity._engine_sha256.__wrapped__() != before
 
 
+@pytest.mark.slow
 def test_the_law_is_that_of_the_scenario(plan: Plan) -> None:
     """Other functions, other law: fidelity, delay, sensors. The same functions: the same law."""
     plans = [
@@ -257,6 +259,7 @@ def test_the_law_is_that_of_the_scenario(plan: Plan) -> None:
     assert revision_of(again.plant, again.controller, planned_run(again).scenario)["law"] == laws[0]
 
 
+@pytest.mark.slow
 def test_a_machine_that_looks_up_a_table_has_a_law_too() -> None:
     """The numbers of the table are part of it."""
     c = malta.gains.read("design/gains/planar.json")

@@ -35,6 +35,7 @@ def _push(t: FloatArray, at: float) -> FloatArray:
     return np.where(t[:, None] >= at, [0.0, 1.0, 0.0, 0.0, 0.0, 0.0], 0.0)
 
 
+@pytest.mark.slow
 def test_a_rest_is_the_same_stroke_begun_later() -> None:
     """Two routes: a settled stroke, and a longer run whose stroke, load and change of the machine come later."""
     plant, controller = _machine()
@@ -76,6 +77,7 @@ def _figures(run: malta.simulation.Trajectory) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow_for("False")
 @pytest.mark.parametrize("bearing", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_figures_of_many_machines_are_of_the_stroke_alone(bearing: bool) -> None:
     """Machines of table2 that settle, touch down in the stroke, and touch down before it."""
@@ -127,11 +129,28 @@ def test_what_may_settle() -> None:
             malta.Scenario.stroke(settle=wrong)
     with pytest.raises(malta.InputError, match="at most"):
         malta.simulate(*_machine(), malta.Scenario.stroke(settle=1e4))
-    plant, _ = _machine()
-    assert settling_option("stroke", plant) == {"settle": 0.3}
-    assert settling_option("hold", plant) == {}
+    plant, law = _machine()
+    assert settling_option("stroke", plant, law) == {"settle": 0.3}
+    assert settling_option("hold", plant, law) == {}
 
 
+def test_a_heavier_sphere_rests_before_its_step() -> None:
+    """It falls with v0 of another mass; a campaign begins where the sum of errors holds it."""
+    spec = malta.read_design("examples/ball/design/ball.toml")
+    law = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    par: Any = spec.parameters
+    heavy = malta.plant_of(replace(par, m=1.1 * par.m))
+    option = settling_option("step", spec.plant, law)
+    assert option == {"settle": 0.4}
+    off = []
+    for settle in (0.0, option["settle"]):
+        run = malta.experiment("step", heavy, law, settle=settle).run
+        off.append(np.abs(run.p[run.t < 0.03]).max())  # the step is at 40 ms
+    assert off[0] > 30e-6
+    assert off[1] < 1e-6
+
+
+@pytest.mark.slow
 def test_commands_settle(run: Run, tmp_path: Path) -> None:
     """Yields after 300 ms at rest unless another rest is asked for; rare events and single runs without."""
     code, out, _ = run("simulate", ROBUST, "--option", "settle=20ms", "--set", "m=0.4", "--json")

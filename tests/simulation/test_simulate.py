@@ -76,6 +76,7 @@ def _linear_response(design: Design, moved: dict[str, float], samples: int, dela
     return response
 
 
+@pytest.mark.slow_for("table2-radial-0")
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize(
     ("moved", "axes"), [(SP1, [0, 1, 2, 3]), ({"z": 1e-6}, [4])], ids=["radial", "axial"]
@@ -143,6 +144,7 @@ def _independent_stroke(plant: Plant, design: Design, samples: int, delay: int) 
     return trace
 
 
+@pytest.mark.slow_for("1")
 @pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_stroke_equals_an_independent_integration(designs: dict[str, Design], delay: int) -> None:
     design = designs["calibrated"]
@@ -166,6 +168,7 @@ def test_the_integrator_has_fourth_order(designs: dict[str, Design]) -> None:
     assert first / second > 8
 
 
+@pytest.mark.slow_for("1", "3")
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_a_design_with_delay_tracks_on_a_machine_with_that_delay(
     designs: dict[str, Design], delay: int

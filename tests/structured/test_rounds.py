@@ -133,6 +133,7 @@ def test_starts_meet_and_no_other_search_finds_less() -> None:
     assert beside.fun > best.merit * (1 - 2e-3)
 
 
+@pytest.mark.slow
 def test_the_positioning_system_of_mathworks_is_proven_over_its_box() -> None:
     """Laws of docs/howto/structured.md: |S| below 1.3 for every stiffness and damping, where the nominal one has 8."""
     robust = {
@@ -152,6 +153,7 @@ def test_the_positioning_system_of_mathworks_is_proven_over_its_box() -> None:
     assert malta.worst_case_gain(positioning(), malta.proof.Compensator(A, -B, C, -D), RANGES).lower > 8
 
 
+@pytest.mark.slow
 def test_a_machine_has_its_own_loop(tmp_path: Path) -> None:
     """The models of a machine under load are the loop of `malta verify`, to the digits of its peaks."""
     controller = malta.gains.read(ROOT / "design" / "gains" / "tubular_pid.json")

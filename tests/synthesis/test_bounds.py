@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -15,12 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
+from flint import Ordering, acb, arb, fmpq, fmpq_mpoly_ctx
 from tampering import claiming
 
 import malta
 from malta.checker import check, file as checked_file, loop as checked_loop
 from malta.linear.closed_loops import closed_loop
+from malta.linear.expressions import exact
 from malta.linear.uncertain import Compensator
 from malta.margins.loop_report import StagePeak
 from malta.margins.travel import smallest_margin
@@ -83,29 +85,67 @@ def test_coefficients_lie_in_their_family() -> None:
             assert abs(scaled - found.values[k] @ weights) <= found.radius[k] + 1e-12
 
 
-@pytest.mark.parametrize("degree_of", [1e-1, 1e-3, 1e-6, 1e-9])
+def _moduli(degree: int, of: Callable[[Any], Any], turn: float) -> tuple[float, float]:
+    """The product of (z - node) on a path z(0 .. turn), in balls over its parts: the least and the largest modulus."""
+    x, parts, found = [2 * exact(u) - 1 for u in nodes(degree, chebyshev=True)], 256 * (degree + 1), []
+    for k in range(parts):
+        product, z = arb(1), of(arb(fmpq(2 * k + 1, 2 * parts) * exact(turn), turn / parts))
+        for node in x:
+            product *= abs(z - node)
+        found.append(product)
+    return min(float(one.lower()) for one in found), max(float(one.upper()) for one in found)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 5, 16])
+@pytest.mark.parametrize("radius", [2.0**0.5, 4.0, 2.0**12])
+def test_the_remainder_of_an_interpolation_covers_hermites_integral(degree: int, radius: float) -> None:
+    """In balls at the rounded nodes: max |w| on the side, R / (R - 1), and min |w| on the circle; and T_n takes it."""
+    ((bound, exponent),) = enclosure.remainder(enclosure.Disc(radius, 0.0, [(1.0, 3)]), degree)
+    assert exponent == 3
+    _, most = _moduli(degree, lambda x: acb(1 - x), 2.0)
+    least, _ = _moduli(degree, lambda b: acb(radius * b.cos(), radius * b.sin()), 3.1416)
+    integral = most / least * radius / (radius - 1)
+    assert 0.95 * bound < integral < 1.1 * bound  # balls over parts of the paths are wide
+    n = (
+        degree + 1
+    )  # T_n is zero at the nodes and one at the end: an error of one, with cosh(n a) on the circle
+    assert 1 / math.cosh(n * math.acosh(radius)) <= bound
+
+
+def test_a_remainder_below_all_numbers_is_not_zero() -> None:
+    ((bound, _),) = enclosure.remainder(enclosure.Disc(2.0**40, 0.0, [(1.0, 0)]), 40)
+    assert 0 < bound < 1e-300
+
+
+@pytest.mark.parametrize("degree_of", [1e-5, 1e-6, 1e-9])
 def test_the_remainder_of_an_interpolation_is_bounded(degree_of: float) -> None:
     """1 / (a - x), whose pole is a little beyond the disc: what is left out at Chebyshev nodes, and its bound."""
     radius = 4.0
     a = 1.01 * radius
     disc = enclosure.Disc(radius, 0.0, [(1 / (a - radius), 0)])
-    side = enclosure.interpolation_side("x", 0, [disc], min(degree_of, 1e-5))
-    if degree_of > 1e-5:
-        side = replace(side, degree=1, tails=((3.5 / radius / (radius - 1) / (a - radius), 0),))
+    side = enclosure.interpolation_side("x", 0, [disc], degree_of)
     d = side.degree
-    nodes = np.cos(np.pi * (np.arange(d + 1) + 0.5) / (d + 1))
+    points = np.cos(np.pi * (np.arange(d + 1) + 0.5) / (d + 1))
     x = np.linspace(-1, 1, 1001)
-    fitted = np.polynomial.chebyshev.Chebyshev.fit(nodes, 1 / (a - nodes), d, domain=[-1, 1])(x)
+    fitted = np.polynomial.chebyshev.Chebyshev.fit(points, 1 / (a - points), d, domain=[-1, 1])(x)
     assert side.tails is not None
     ((bound, exponent),) = side.tails
-    constant = 1 + 2 / math.pi * math.log(d + 1)
-    largest = 1 / (a - radius)
-    cauchy = (1 + constant) * largest * radius**-d / (radius - 1)
-    assert np.abs(fitted - 1 / (a - x)).max() <= 0.99 * cauchy + 1e-15
-    # 3.5 covers 1 + Lambda up to this degree; HIGHEST and the constants of the axes before cover the rest
+    left = np.abs(fitted - 1 / (a - x)).max()
     assert (
-        math.ldexp(bound, exponent) >= min((1 + constant), 3.5) * largest * radius**-d / (radius - 1) * 0.999
+        1e-3 * math.ldexp(bound, exponent)
+        < left - 1e-15
+        <= math.ldexp(bound, exponent)
+        <= degree_of / (a - radius)
     )
+
+
+def test_errors_of_axes_are_summed_with_the_constants_of_those_before() -> None:
+    sides = [enclosure.Side(d, True, ((m, 0), (2 * m, 1))) for d, m in ((1, 1.0), (3, 8.0), (2, 2.0))]
+    sides.append(enclosure.Side(2, False, None))
+    total = enclosure.sum_tails(sides)
+    assert total is not None
+    wanted = 8 + enclosure.lebesgue(3) * (2 + enclosure.lebesgue(2) * 1)
+    assert [math.ldexp(m, e) for m, e in total] == pytest.approx([wanted, 4 * wanted], rel=1e-12)
 
 
 def test_bounds_add_up() -> None:
@@ -450,13 +490,13 @@ def test_frequencies_that_no_cell_covers_are_missed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degree", range(1, 17))
 def test_interpolation_is_no_further_off_than_its_constant(degree: int) -> None:
-    """1 + Lambda at the nodes that are taken, the largest sum of Lagrange's polynomials' moduli."""
+    """Lambda at the nodes that are taken, the largest sum of Lagrange's polynomials' moduli."""
     u, x = np.array(nodes(degree, chebyshev=True)), np.linspace(0, 1, 4001)
     total = np.zeros(len(x))
     for k in range(degree + 1):
         others = np.delete(u, k)
         total += np.abs(np.prod((x[:, None] - others) / (u[k] - others), axis=1))
-    assert enclosure.LEBESGUE - 0.9 < 1 + max(total.max(), 2.2) <= enclosure.LEBESGUE
+    assert 0.95 * enclosure.lebesgue(degree) < total.max() <= enclosure.lebesgue(degree)
 
 
 @pytest.mark.parametrize("shape", [(2,), (2, 2, 2), (3,), (5, 4), (8,), (17,), (17, 3)])

@@ -205,6 +205,7 @@ def plant_positions(plant: Plant) -> FloatArray:
     return malta.linearize(plant, plant.at()).C[:, :5]
 
 
+@pytest.mark.slow_for("planar", "planar_pid")
 @pytest.mark.parametrize("name", [p.stem for p in sorted(Path("design/gains").glob("*.json"))])
 def test_loops_are_those_of_verify(name: str) -> None:
     controller = malta.gains.read(f"design/gains/{name}.json")
@@ -232,6 +233,7 @@ def test_peak_sensitivity_is_the_norm_of_s(model: LinearModel, table2: Controlle
     assert control.linfnorm(loop.S)[0] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_plots_of_python_control_take_them(loop: LoopSystems, table2: Controller) -> None:
     with mpl.rc_context({"backend": "Agg"}), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what the plots' own library says
@@ -426,3 +428,11 @@ def test_a_file_whose_law_is_not_of_errors(table: str, key: str, ball: Plant, tm
     content["sha256"] = encodings.content_sha256(content)
     path.write_text(json.dumps(content))
     assert refusal(lambda: malta.gains.read(path), path).field == f"{table}.{key}"
+
+
+def test_a_compensator_is_made_of_the_fields_of_a_law(table2: malta.synthesis.Controller) -> None:
+    """The attribute of before answers with what to write."""
+    law = malta.proof.Compensator(**table2.compensator_fields)
+    assert (law.sample_time, law.D.shape) == (table2.sample_time, (5, 5))
+    with pytest.raises(malta.InputError, match="compensator_fields"):
+        _ = table2.compensator

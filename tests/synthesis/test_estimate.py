@@ -76,6 +76,7 @@ def _steady(c: Controller) -> FloatArray:
 RADIAL = [0, 1, 3, 4, 5, 6, 8, 9]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discretization", ["zoh", "sampled-data"])
 def test_the_gain_settles_at_riccatis(calibrated: Design, discretization: Any) -> None:
     """After 20 ms the radial gains, measured on the running filter, are the solution's to 1e-8. Under a zero-order hold
@@ -90,6 +91,7 @@ def test_the_gain_settles_at_riccatis(calibrated: Design, discretization: Any) -
     assert discretization == "zoh" or apart > 1e-7
 
 
+@pytest.mark.slow
 def test_the_axial_gain_settles_too(calibrated: Design) -> None:
     """With 1e4 times the force noise its slow pair is ten times as fast: 600 samples then settle it to 1e-6."""
     weights = calibrated.spec.weights
@@ -146,6 +148,7 @@ def _lift_off(
     return malta.simulate(plant, controller, scenario, engine=VIRTUAL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fidelity", "passes"), [("force", 0.25e-3), ("dq", 0.15e-3)])
 def test_a_lift_off_overshoots_little_with_a_filter_that_starts_wide(
     calibrated: Design, par: tubular.Parameters, fidelity: Any, passes: float
@@ -163,6 +166,7 @@ def test_a_lift_off_overshoots_little_with_a_filter_that_starts_wide(
     assert max(beyond["kalman"], beyond["extended"]) < 25e-6
 
 
+@pytest.mark.slow
 def test_only_the_extended_filter_knows_what_holds_a_mover_at_rest(
     calibrated: Design, par: tubular.Parameters
 ) -> None:
@@ -191,6 +195,7 @@ def test_only_the_extended_filter_knows_what_holds_a_mover_at_rest(
 # In flight
 
 
+@pytest.mark.slow_for("kalman", "extended")
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_filter_flies_a_stroke(calibrated: Design, estimator: Estimator) -> None:
     """5 mm in 6 ms with noise, on the drive in dq: within what the paper allows of a slower one, and each estimates the
@@ -205,6 +210,7 @@ def test_every_filter_flies_a_stroke(calibrated: Design, estimator: Estimator) -
     assert places.max() < 0.5e-6 / math.sqrt(2) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["kalman", "extended"])
 def test_filters_of_a_design_with_delay_know_what_is_under_way(
     calibrated: Design, estimator: Estimator
@@ -225,6 +231,7 @@ def test_filters_of_a_design_with_delay_know_what_is_under_way(
     assert not run.xi_hat[0, 10:].any()
 
 
+@pytest.mark.slow_for("0.002-1e+30-extended")
 @pytest.mark.parametrize("estimator", ["kalman", "extended"])
 @pytest.mark.parametrize("size", [math.nan, math.inf, 1e30, 1e308])
 @pytest.mark.parametrize("at", [0.0, 40 * Ts])
@@ -239,6 +246,7 @@ def test_a_filter_that_is_lost_ends_its_run_with_a_verdict(
     assert len(run.x) == len(run.t) == len(run.v)
 
 
+@pytest.mark.slow_for("extended")
 @pytest.mark.parametrize("estimator", ["kalman", "extended"])
 def test_a_filter_sees_what_the_sensors_of_a_changed_machine_say(
     calibrated: Design, estimator: Estimator

@@ -122,6 +122,7 @@ except SystemExit as ended:
 """
 
 
+@pytest.mark.slow_for("examples/ball/design/ball_pid.toml-expected1")
 @pytest.mark.parametrize(
     ("design", "expected"),
     [
@@ -154,6 +155,7 @@ print(document["sha256"], control.slycot_check())
 """
 
 
+@pytest.mark.slow_for("table2")
 @pytest.mark.parametrize("name", ["table2", pytest.param("robust", marks=pytest.mark.slow)])
 def test_a_gain_file_is_the_same_with_and_without_slycot(name: str) -> None:
     pytest.importorskip("slycot", reason="slycot is not installed")

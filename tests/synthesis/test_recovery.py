@@ -50,6 +50,7 @@ def calibrated() -> Machine:
     return machine_of("calibrated")
 
 
+@pytest.mark.slow
 def test_the_answer_is_that_of_the_samples_one_by_one() -> None:
     """An oscillator with a slow pole beside it, over every octave of the grid."""
     M = np.diag([0.0, 0.0, 0.9995])
@@ -157,6 +158,7 @@ def test_the_nonlinear_machine_answers_alike(calibrated: Machine, name: str) -> 
     assert np.abs(moved - y).max() < 2e-3 * np.abs(y).max()
 
 
+@pytest.mark.slow_for("planar_pid")
 @pytest.mark.parametrize("file", ["halbach", "halbach_pid", "planar", "planar_pid"])
 def test_every_machine_has_a_table_of_80_columns(file: str) -> None:
     plant, c = machine_of(file)
@@ -193,6 +195,7 @@ def test_disturbances_are_forces_on_the_masses(calibrated: Machine) -> None:
     assert not B[:5].any()
 
 
+@pytest.mark.slow
 def test_verify_prints_loads_and_writes_them_as_json(run: Run) -> None:
     gains = str(ROOT / "design" / "gains" / "halbach.json")
     said = run("verify", gains, "--no-proof")

@@ -141,6 +141,7 @@ def compare(name: str, other: Step, count: int) -> None:
     assert ((shares > 0.002) & (shares < 0.99))[:checked].all(), shares
 
 
+@pytest.mark.slow_for("robust", "table2")
 @pytest.mark.parametrize("name", ["robust", "table2", "halbach_late"])
 def test_a_few_samples_are_those_of_the_engine(name: str) -> None:
     compare(name, step_of_engine(target(name, "double")), FEW)
@@ -152,6 +153,7 @@ def test_forces_and_duty_cycles_are_those_of_the_engine(name: str) -> None:
     compare(name, step_of_engine(target(name, "double")), STEPS)
 
 
+@pytest.mark.slow_for("halbach_late")
 @pytest.mark.parametrize("name", [n if n == "halbach_late" else pytest.param(n, marks=SLOW) for n in NAMES])
 def test_forces_and_duty_cycles_are_those_of_the_c(name: str) -> None:
     if compiler() is None:

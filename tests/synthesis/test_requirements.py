@@ -84,6 +84,7 @@ def robust() -> Spec:
     return malta.read_design(ROOT / "design" / "robust.toml")
 
 
+@pytest.mark.slow
 def test_a_search_sees_bounds_of_single_signals(robust: Spec) -> None:
     """Mirror images are told apart where their bounds differ, and only there."""
     asked = {"motion x1": 1e-6, "motion y1": 1e-6, "motion z": 1e-5}
@@ -100,6 +101,7 @@ def test_a_search_sees_bounds_of_single_signals(robust: Spec) -> None:
     assert len({g.picture for g in uneven}) == 3
 
 
+@pytest.mark.slow
 def test_a_search_sees_a_filter_that_observes_forces(robust: Spec) -> None:
     """In place of integrals: the figures of a trial are those of the judged design."""
     weights = replace(robust.weights, q_i=np.zeros(5), drift_variance=np.full(5, 1e-3))
@@ -210,6 +212,7 @@ position = { vary = ["bases.state.y"], low = 5, high = 500, unit = "um" }
 """
 
 
+@pytest.mark.slow
 def test_a_machine_of_ones_own_without_a_stroke_is_tuned_for_its_own_requirement(tmp_path: Path) -> None:
     (tmp_path / "floater.py").write_text(FLOATER, encoding="utf-8")
     quantity = '{{ value = {}, unit = "{}", tag = "assumed", source = "test" }}'
@@ -279,6 +282,7 @@ def robust_file(folder: Path, specification: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_loads_from_outside_are_bounded_and_the_search_sees_them_as_the_judge_does(tmp_path: Path) -> None:
     spec = malta.read_design(robust_file(tmp_path, LOADS))
     names = [f"recovery F_x {what}" for what in ("largest", "left 0.1 s", "left 0.3 s", "largest anywhere")]

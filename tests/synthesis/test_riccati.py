@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
 
 
+@pytest.mark.slow
 @given(
     sign=st.sampled_from([-1, 0, 1]),
     w=st.floats(1, 1e4),
@@ -307,6 +308,7 @@ def test_a_pendulum_at_any_sample_time_and_weight(sign: int, Ts: float) -> None:
         assert (off <= of_gain(A, B, Q, R, X, sampled=True, residual=residual)).all()
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(
     modes=st.lists(st.floats(-4, 4), min_size=1, max_size=3),

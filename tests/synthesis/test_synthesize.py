@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Discretization
 
 
+@pytest.mark.slow
 def test_the_three_ways_agree_as_the_sample_time_falls(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
     K, Ki = malta.synthesis.lqi(design.model, design.spec.weights)
@@ -139,6 +140,7 @@ def test_weights_refuse_what_is_no_weight(designs: dict[str, Design]) -> None:
         replace(weights, q_base=weights.q_base[:4])
 
 
+@pytest.mark.slow
 def test_any_operating_point_can_be_designed_for(plant: Plant, designs: dict[str, Design]) -> None:
     """Off the centre the modes couple; the design stays stable on the machine over the travel."""
     for z in (-15e-3, -7.3e-3, 15e-3):

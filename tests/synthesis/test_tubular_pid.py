@@ -13,17 +13,7 @@ from conftest import ROOT, Run, one_sentence, refusal
 import malta
 from malta.loops.sampled_loops import machine_loop
 from malta.loops.time_domain import recovery
-from malta.machines.tubular import paper as tubular
-from malta.machines.tubular.paper.quantities import (
-    axial_deviation,
-    axis_coupling,
-    evidence as evidence_of,
-    load_deviation,
-    noise_forces,
-)
-from malta.margins.loop_report import Outcome
-from malta.report import ledger as claims
-from malta.report.ledger import Row
+from malta.margins.outcome import Outcome
 from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.flown_strokes import stroke_figures
 from malta.synthesis.law import law
@@ -34,14 +24,24 @@ from malta.tuning.outcomes import SynthesizedDesign
 from malta.tuning.pid import CORNER_TOLERANCE, close_loop, estimates_of, name_of, outputs_of, parts_of
 from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
 from malta.tuning.search import model_and_controller
+from malta_papers import ledger as claims
+from malta_papers.ledger import Row
+from malta_papers.tubular import claims as tubular
+from malta_papers.tubular.quantities import (
+    axial_deviation,
+    axis_coupling,
+    evidence as evidence_of,
+    load_deviation,
+    noise_forces,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from malta.machines.tubular.paper.quantities import TubularEvidence
     from malta.model.linearize import LinearModel
     from malta.synthesis.spec import Spec
+    from malta_papers.tubular.quantities import TubularEvidence
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -71,8 +71,8 @@ def design(spec: Spec) -> SynthesizedDesign:
 @pytest.fixture(scope="module")
 def found(spec: Spec, published: dict[str, Any]) -> Iterator[TubularEvidence]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("malta.machines.tubular.paper.quantities.MACHINES", 16)
-        patch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", 2)
+        patch.setattr("malta_papers.tubular.quantities.MACHINES", 16)
+        patch.setattr("malta_papers.tubular.quantities.LEARNERS", 2)
         yield evidence_of(spec, published)
 
 

@@ -21,7 +21,8 @@ from malta.linear.matrices import eigenvalues
 from malta.loops.noise import noise_of, noise_variance
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular.requirements import DRIVE
-from malta.margins.loop_report import BANDWIDTHS, Outcome
+from malta.margins.loop_report import BANDWIDTHS
+from malta.margins.outcome import Outcome
 from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.linear_law import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
-pytestmark = pytest.mark.usefixtures("proven_once")
+pytestmark = [pytest.mark.usefixtures("proven_once"), pytest.mark.first]
 
 ROBUST = ROOT / "design" / "robust.toml"
 QUICK = Effort(generations=1, polish=3, front=0)
@@ -104,6 +105,7 @@ def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Contr
     assert 3.5 <= robust.lower <= robust.upper <= 1.002 * robust.lower
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", [-15e-3, -7e-3, 0.0, 4e-3, 15e-3])
 def test_every_corner_at_350_percent_is_stable(
     z: float, spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport]
@@ -134,6 +136,7 @@ def test_its_sensitivity_and_bandwidth(flagship: tuple[LinearModel, Controller, 
         assert margins.bandwidth[definition] >= 400, definition
 
 
+@pytest.mark.slow
 def test_its_noise_by_two_ways(spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport]) -> None:
     """The covariance, the integral of |T|^2 over all frequencies, and the simulated machine with its steps of 1 um."""
     model, controller, _ = flagship
@@ -211,6 +214,7 @@ def test_the_law_of_gains_is_the_controllers(
             assert getattr(law, name) == pytest.approx(own, rel=1e-12, abs=1e-12 * np.abs(own).max())
 
 
+@pytest.mark.slow
 def test_quick_figures_are_those_of_verify(
     spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport], requirements: Any
 ) -> None:
@@ -240,6 +244,7 @@ def requirements_of(requirements: dict[tuple[str, str], Outcome], name: str) -> 
     return next(r.found for (own, _), r in requirements.items() if own == name)
 
 
+@pytest.mark.slow
 def test_an_unstable_trial_has_no_figures(spec: Spec) -> None:
     cluster = clusters_of(spec)[0]
     hasty = replace(spec.weights, process_variance=spec.weights.process_variance * 1e10)
@@ -476,6 +481,7 @@ def test_what_varies_must_stand_in_the_file(tmp_path: Path) -> None:
     assert error.field == "search.numbers.thrust.vary"
 
 
+@pytest.mark.slow
 def test_a_variable_without_effect_is_refused(tmp_path: Path) -> None:
     """The base of a weight that is zero."""
     other = 'stroke = { vary = ["bases.state.x_dot"], low = 0.1, high = 100, unit = "mm/s" }'
@@ -505,6 +511,7 @@ def bare(folder: Path, *asked: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_command_finds_writes_and_goes_on(run: Any, tmp_path: Path) -> None:
     path, out = bare(tmp_path, "margin = 2.8", "peak_sensitivity = 2"), tmp_path / "out"
     quick = ("--generations", "0", "--front", "0")

@@ -164,6 +164,7 @@ def goal(search: TrialSearch, u: Any) -> float:
 # --- figures ---
 
 
+@pytest.mark.slow_for("mover")
 @pytest.mark.parametrize("name", ["motor", "mover"])
 def test_the_load_error_is_the_sum_over_a_simulated_step(name: str, request: pytest.FixtureRequest) -> None:
     """A force as one more state of the machine between samples, which holds still, and ten thousand samples."""
@@ -210,6 +211,7 @@ def test_the_motion_from_noise_by_two_ways(motor: Spec) -> None:
     assert ours == pytest.approx(math.sqrt(linalg.solve_discrete_lyapunov(M, noise)[0, 0]), rel=0.02)
 
 
+@pytest.mark.slow_for("mover")
 @pytest.mark.parametrize("name", ["motor", "mover"])
 def test_parts_have_the_figures_of_the_whole_machine(name: str, request: pytest.FixtureRequest) -> None:
     spec: Spec = request.getfixturevalue(name)
@@ -270,6 +272,7 @@ def test_the_bounds_hold_where_it_counts(found: TuningResult) -> None:
     assert found.front == ()
 
 
+@pytest.mark.slow
 def test_a_tighter_bound_on_motion_costs_load_error(motor: Spec, found: TuningResult) -> None:
     asked = {**motor.specification, "noise_motion x": 2.3e-6}
     calm = tuned(replace(motor, specification=asked), effort=Effort(generations=5))
@@ -317,6 +320,7 @@ def test_an_axis_of_six_is_searched_by_itself(mover: Spec) -> None:
     assert np.flatnonzero(old.Ki != new.Ki).tolist() == [2]
 
 
+@pytest.mark.slow
 def test_a_shared_filter_joins_all_axes(mover: Spec, monkeypatch: pytest.MonkeyPatch) -> None:
     shared = mover.search[0]._replace(name="filter", entries=("pid.filter",), low=1.0, high=1e3, unit="us")
     spec = replace(mover, search=(*mover.search, shared))
@@ -442,6 +446,7 @@ def run(run: Run) -> Run:
     return partial(run, "tune")
 
 
+@pytest.mark.slow
 def test_the_command_finds_gains_and_judges_them(run: Any, tmp_path: Path) -> None:
     path, out = motor_file(tmp_path), tmp_path / "out"
     code, text, err = run(path, "--check")
@@ -461,6 +466,7 @@ def test_the_command_finds_gains_and_judges_them(run: Any, tmp_path: Path) -> No
     assert rows["peak_sensitivity"]["ratio"] == pytest.approx(1, abs=1e-4)
 
 
+@pytest.mark.slow_for("halbach_pid")
 @pytest.mark.parametrize("name", ["halbach_pid", pytest.param("planar_pid", marks=pytest.mark.slow)])
 def test_the_shipped_gains_are_those_that_the_search_ends_with(name: str) -> None:
     """Every bound holds, and no polish from there finds a load error that is smaller by 0.1 %."""

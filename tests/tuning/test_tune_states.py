@@ -12,6 +12,7 @@ from conftest import ROOT
 
 import malta
 from malta.linear.matrices import eigenvalues
+from malta.loops.noise import noise_of
 from malta.loops.sampled_loops import machine_loop
 from malta.margins.verify import machine_report
 from malta.model import Signal
@@ -90,6 +91,22 @@ def test_the_margin_of_a_trial_is_that_of_the_worst_value_of_its_intervals(widen
         return float(max(sizes))
 
     assert radius(0.98 * found) < 1 < radius(1.02 * found)
+
+
+@pytest.mark.parametrize("name", ["car", "spindle"])
+def test_a_trial_sees_lag_and_dead_time_of_sensors(name: str) -> None:
+    """Half a sample of dead time, and lags: peaks and motions of the outputs are those of the machine's own loop."""
+    folder = ROOT / "tests" / "foreign" / name
+    spec = malta.read_design(folder / "design" / f"{name}.toml")
+    found, plant = figures(spec), spec.plant
+    model = malta.linearize(plant, plant.at())
+    law = malta.synthesize(spec, model)
+    peaks = machine_report(model, law).stages[0].peak_sensitivity
+    assert found["peak_sensitivity"] == pytest.approx(max(peaks[s.name] for s in plant.outputs), rel=1e-8)
+    motion = noise_of(malta.loop(plant, law).sampled, plant).motion[0]
+    assert found[f"motion {plant.outputs[0].name}"] == pytest.approx(float(motion), rel=1e-8)
+    prompt = replace(spec, parameters=replace(spec.parameters, **({"T_s" if name == "car" else "T_f": 0.0})))
+    assert figures(prompt)["peak_sensitivity"] < 0.999 * found["peak_sensitivity"]
 
 
 def test_other_intervals_are_another_search(widened: Path) -> None:

@@ -5,7 +5,7 @@ import { createChart, stroke } from "./chart.js";
 import { createPanel, dropDown, element } from "./controls.js";
 import { exportChart } from "./export.js";
 import { color, dash, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
-import { digits, hertz, quantity } from "./numbers.js";
+import { digits, hertz, quantity, sizeOf } from "./numbers.js";
 import { countLights, differenceTable, figureTable, howToAsk, requirementRows } from "./tables.js";
 import { createTuner } from "./tuning.js";
 
@@ -13,12 +13,24 @@ const MOST_PINS = 4;
 const MOST_GHOSTS = 3; // candidates of a search that are drawn
 const MOST_UNDO = 200;
 const GONE = "malta app has ended: start it again to go on";
+const WORST = "worst load"; // the run
 const NEAR = 1.6, WIDE = 10; // of the Nyquist chart
 const SHORTCUTS = [["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["P", "pin this design"], ["R", "reset to the file"], ["Ctrl S", "save the design file"],
   ["/", "find a number"], ["?", "this list"], ["← →", "move a slider, a handle or the readout of a chart"], ["+ − 0", "zoom into a chart, out, and back; a drag draws a box"], ["Page ↑ ↓", "move a slider by a tenth"], ["↑ ↓", "a number field by 1 %, with Shift 10 %"], ["Esc", "take a number back, hide a readout"]];
 
-export async function mount(root, transport) {
+export async function mount(root, { ask: send, listen }) {
   root.classList.add("malta-app");
+  const tab = Math.random().toString(36).slice(2);
+  const lose = (text) => { root.inert = true; root.replaceChildren(element("p", { class: "fatal", role: "alert" }, text)); };
+  // Another page that opens the design takes it along: this one asks nothing any more.
+  const transport = {
+    ask: async (body) => {
+      const answer = await send({ ...body, page: tab });
+      if (answer.lost) lose(answer.lost);
+      return answer.lost ? new Promise(() => {}) : answer;
+    },
+    listen: (heard) => listen(heard, tab),
+  };
   let description;
   try {
     description = await transport.ask({ ask: "open" });
@@ -29,9 +41,9 @@ export async function mount(root, transport) {
   }
   const state = {
     description, values: {}, redesign: true, undo: [], redo: [], pins: [], pinned: 0,
-    picture: null, simulated: null, requirements: {}, proof: null, version: 0, number: 0, failed: "",
+    picture: null, simulated: null, requirements: {}, proof: null, safe: null, version: 0, number: 0, failed: "",
     run: description.runs[0], load: description.loads[0]?.name ?? "", runGroup: "", loadGroup: "",
-    old: new Set(), sens: "S", reach: NEAR, poles: "slow", map: null, there: null, mapX: "", mapY: "", table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
+    old: new Set(), limits: [], sens: "S", reach: NEAR, poles: "slow", map: null, there: null, mapX: "", mapY: "", table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
   };
   const fresh = () => Object.fromEntries(state.description.fields.map((field) => [field.key, field.value]));
   state.values = { ...fresh(), ...description.edit.values };
@@ -43,7 +55,7 @@ export async function mount(root, transport) {
   const lights = element("button", { type: "button", class: "lights", title: "requirements", onclick: () => { state.table = "requirements"; drawTables(); tables.scrollTop = 0; tables.scrollIntoView({ block: "nearest" }); } });
   const speed = element("span", { class: "speed", "aria-hidden": "true" });
   const designs = element("select", { "aria-label": "other designs", title: "open another design", onchange: () => openDesign(designs.value) });
-  const title = element("h1", {}), subtitle = element("span", { class: "soft" });
+  const title = element("h1", {}), subtitle = element("span", { class: "soft" }), machine = element("span", { class: "machine" });
   const undo = button("↶ Undo", "Ctrl Z", () => step("undo", "redo")), redo = button("↷ Redo", "Ctrl Y", () => step("redo", "undo"));
   const reset = button("Reset", "to the numbers of the file (R)", () => commit({ values: fresh(), redesign: true }));
   const pin = button("Pin", "keep this design beside (P)", pinDesign);
@@ -51,9 +63,9 @@ export async function mount(root, transport) {
   const gains = button("Gain files", "malta design: verify, simulate, write", writeGains);
   const theme = button("◐", "light or dark", turnTheme, { "aria-label": "light or dark" });
   const help = button("?", "shortcuts", () => shortcuts.showModal(), { "aria-label": "shortcuts" });
-  const message = element("div", { class: "message", role: "alert" });
+  const message = element("div", { class: "message", role: "alert", title: "click to hide", onclick: () => say("") });
   const pins = element("div", { class: "pins" });
-  const header = element("header", {}, element("div", { class: "name" }, element("div", { class: "which" }, title, dropDown("▾", designs)), subtitle), badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
+  const header = element("header", {}, element("div", { class: "name" }, element("div", { class: "which" }, title, dropDown("▾", designs)), subtitle), machine, badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
 
   const ties = element("input", { type: "checkbox", onchange: () => { state.ties = ties.checked; } });
   const redesign = element("input", { type: "checkbox", onchange: () => commit({ values: state.values, redesign: redesign.checked }) });
@@ -91,14 +103,15 @@ export async function mount(root, transport) {
   const poleTabs = tabs([["slow", "slow"], ["all", "all"], ["map", "margin map"]], () => state.poles, (value) => { state.poles = value; if (value === "map") askMap(); });
   const mapXs = pick("parameter along x", () => state.mapX, (value) => { state.mapX = value; askMap(); });
   const mapYs = pick("parameter along y", () => state.mapY, (value) => { state.mapY = value; askMap(); });
+  const worst = button(WORST, "the load of this size, chosen under Load, whose waveform uses most of a clearance", () => { state.run = runList.value = WORST; state.simulated = null; ask(); });
   const runList = pick("run", () => state.run, (value) => { state.run = value; state.simulated = null; ask(); });
   const runGroups = pick("signals of the run", () => state.runGroup, (value) => { state.runGroup = value; draw(); });
-  const loadList = pick("load", () => state.load, (value) => { state.load = value; ask(); });
+  const loadList = pick("load", () => state.load, (value) => { state.load = value; if (state.run === WORST) state.simulated = null; ask(); });
   const loadGroups = pick("outputs under the load", () => state.loadGroup, (value) => { state.loadGroup = value; draw(); });
   card("sensitivity", "Sensitivity", sensTabs);
   card("nyquist", "Nyquist", reachTabs);
   card("poles", "Poles", mapXs, mapYs, poleTabs);
-  card("run", "Run", runList, runGroups);
+  card("run", "Run", worst, runList, runGroups);
   card("load", "Load", loadList, loadGroups);
   const tableTabs = tabs([["requirements", "Requirements"], ["figures", "Figures"], ["changes", "Changes"]], () => state.table, (value) => { state.table = value; });
   const tables = element("div", { class: "tables", tabindex: "0", role: "region", "aria-label": "tables" });
@@ -220,8 +233,8 @@ export async function mount(root, transport) {
     state.told = null;
     // Nothing that was proven or measured of the last design is shown beside the numbers of the next.
     state.past = { ...state.past, ...state.requirements, ...(state.proof?.lower ? { margin: { found: state.proof.lower, text: state.proof.proven } } : {}) };
-    if (!state.moving) last = { version: state.version, proof: state.proof, requirements: state.requirements, simulated: state.simulated };
-    Object.assign(state, { moving: true, proof: null, requirements: {}, simulated: null });
+    if (!state.moving) last = { version: state.version, proof: state.proof, safe: state.safe, requirements: state.requirements, simulated: state.simulated };
+    Object.assign(state, { moving: true, proof: null, safe: null, requirements: {}, simulated: null });
     panel.show(state.values);
     redesign.checked = state.redesign;
     drawHeader();
@@ -262,9 +275,11 @@ export async function mount(root, transport) {
     state.failed = answer.error ?? "";
     if (answer.version !== undefined && answer.version !== state.version) {
       state.past = { ...state.past, ...state.requirements };
-      Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null, there: null });
+      Object.assign(state, { version: answer.version, requirements: {}, proof: null, safe: null, simulated: null, there: null });
     } else if (state.moving && answer.version === last.version) Object.assign(state, last);
     if (!answer.error) {
+      state.description.requirements = answer.requirements;
+      state.limits = answer.limits.map(withBound);
       state.old = new Set(answer.missing);
       state.picture = withOld(answer, state.picture);
       speed.textContent = `${Math.round(milliseconds)} ms`;
@@ -275,6 +290,14 @@ export async function mount(root, transport) {
     root.classList.toggle("failed", Boolean(answer.error));
     if (state.failed || message.classList.contains("error")) say(state.failed, "error");
     draw();
+  }
+
+  // A bound that is one number of the file is pulled: a move of that number, in its unit.
+  function withBound(limit) {
+    const field = state.description.fields.find((one) => one.key === limit.field), unit = state.description.requirements.find((one) => one.name === limit.entry).unit;
+    const [size, base] = field ? sizeOf(field.unit) : [1, ""];
+    const pulled = field && (base === unit || (!field.unit && unit === "1"));
+    return { ...limit, text: quantity(limit.asked, unit), pull: pulled ? (asked, done) => change(field, Number((asked / size).toPrecision(3)), done) : null };
   }
 
   // Parts that follow stand as they were, grey; figures too. Of an unstable design the server leaves out nothing.
@@ -295,17 +318,23 @@ export async function mount(root, transport) {
 
   function hear(item) {
     if (item.kind === "gone") { say(GONE, "error"); return; }
+    if (item.kind === "lost") { lose(item.text); return; }
     if (item.version === null) { tuner.hear(item); return; }
     if (item.version > state.version || state.moving) { early.push(item); return; }
     if (item.version < state.version || !state.picture) return;
     if (item.kind === "requirement") state.requirements[item.name] = item;
-    if (item.kind === "proof") state.proof = item;
+    if (item.kind === "proof") {
+      state.proof = item;
+      for (const one of state.pins) if (one.version === state.version) one.proof = item;
+    }
+    if (item.kind === "safe") state.safe = item;
     if (item.kind === "map") state.map = item;
     if (item.kind === "run") state.simulated = item;
     if (item.kind === "margin") state.picture.margin = item;
     if (item.kind === "failed") say(item.error, "error");
     if (item.kind === "notice") say(item.text);
-    if (item.kind === "run" || state.poles === "map") draw();
+    const binds = item.kind === "requirement" && state.limits.some((one) => one.entry === item.name);
+    if (item.kind === "run" || item.kind === "safe" || binds || state.poles === "map") draw();
     else { drawHeader(); drawTables(); }
   }
 
@@ -362,8 +391,8 @@ export async function mount(root, transport) {
     for (const group of [sensTabs, reachTabs, poleTabs]) group.mark();
     for (const [key, part] of Object.entries({ sensitivity: "frequency", nyquist: "frequency", run: "run", load: "load" })) charts[key].node.parentElement.classList.toggle("old", state.old.has(part));
     const names = picture.frequency.sensors;
-    show(charts.sensitivity, sensitivityView(picture, pins, state.sens, state.hidden, pull));
-    show(charts.nyquist, nyquistView(picture, pins, state.reach, state.hidden, pull));
+    show(charts.sensitivity, sensitivityView(picture, pins, state.sens, state.hidden, pull, state));
+    show(charts.nyquist, nyquistView(picture, pins, state.reach, state.hidden, pull, state));
     const mapped = state.poles === "map", uncertain = Object.keys(state.description.parameters);
     mapXs.hidden = mapYs.hidden = !mapped || uncertain.length < 2;
     poleTabs.lastChild.hidden = uncertain.length < 2;
@@ -391,7 +420,14 @@ export async function mount(root, transport) {
     charts.run.note.textContent = !simulated ? "linear loop; the simulation follows" : simulated.error ? `no simulation: ${simulated.error}`
       : `– – linear   —— simulated${simulated.engine === "compiled" ? "" : ` (${simulated.engine})`}${simulated.completed ? "" : `: ${simulated.verdict} at ${digits(simulated.end, 3)} s`}`;
     charts.run.note.title = charts.run.note.textContent;
-    if (state.picture.load) charts.load.note.textContent = `1 ${state.description.loads.find((load) => load.name === state.picture.load.name).unit} of ${state.picture.load.name}, constant from t = 0, linear loop`;
+    if (state.picture.load) drawLoadNote(state.description.loads.find((load) => load.name === state.picture.load.name));
+  }
+
+  // What is drawn of a load, and what the worker proved of any waveform of it.
+  function drawLoadNote({ name, unit }) {
+    const { safe } = state, size = safe?.loads[name], { note } = charts.load, drawn = `1 ${unit} of ${name}, constant from t = 0, linear loop`;
+    note.textContent = size ? `1 ${unit} from t = 0, linear; any ${name} ≤ ${size} touches nothing: proven` : drawn;
+    note.title = !safe ? drawn : `${drawn}. ${size ? `Any waveform of ${name} up to ${size} touches nothing and saturates nothing: proven of the nonlinear machine with forces as commanded. Beyond: ` : "Nothing is proven of any waveform: "}${safe.ends[name]}`;
   }
 
   function drawTables() {
@@ -427,21 +463,22 @@ export async function mount(root, transport) {
     const { description: d } = state, count = Object.keys(changes()).length;
     title.textContent = `${d.name}${count ? " ·" : ""}`;
     title.title = d.summary;
+    if (machine.of !== d.picture) machine.innerHTML = machine.of = d.picture;
     subtitle.textContent = `${d.law} for ${d.machine} (${d.preset})${count ? `, ${count} changed` : ""}${state.redesign ? "" : ", machine differs"}`;
     const [kind, text, more] = badgeText();
     badge.className = `badge ${kind}`;
     badge.replaceChildren(element("b", {}, text), element("small", { title: more }, more), speed);
     undo.disabled = !state.undo.length;
     redo.disabled = !state.redo.length;
-    pin.disabled = !state.picture || Boolean(state.failed) || state.old.size > 0;
+    pin.disabled = !state.picture || Boolean(state.failed) || Boolean(state.moving) || state.old.size > 0;
     pins.replaceChildren(...state.pins.map((one) => element("span", { class: "pin" }, button(one.name, "go back to this design", () => commit(one)), button("×", `forget ${one.name}`, () => { state.pins = state.pins.filter((other) => other !== one); draw(); }, { "aria-label": `forget ${one.name}` }))));
   }
 
   // --- pins, saving ---
   function pinDesign() {
-    if (!state.picture || state.failed || state.old.size) return;
+    if (!state.picture || state.failed || state.moving || state.old.size) return; // the picture is not of these numbers
     const name = String.fromCharCode(65 + (state.pinned++ % 26));
-    state.pins = [...state.pins, { name, ...snapshot(), picture: state.picture, proof: state.proof }].slice(-MOST_PINS);
+    state.pins = [...state.pins, { name, ...snapshot(), picture: state.picture, proof: state.proof, version: state.version }].slice(-MOST_PINS);
     state.table = state.table === "requirements" ? "figures" : state.table;
     draw();
   }
@@ -507,7 +544,7 @@ export async function mount(root, transport) {
       leaving.showModal();
     }
     if (!answer.open) return;
-    Object.assign(state, { undo: [], redo: [], pins: [], candidates: [], front: [], picture: null, ghost: null, proof: null, requirements: {}, past: {}, simulated: null, map: null, there: null,
+    Object.assign(state, { undo: [], redo: [], pins: [], candidates: [], front: [], picture: null, ghost: null, proof: null, safe: null, requirements: {}, past: {}, simulated: null, map: null, there: null,
       run: answer.open.runs[0], load: answer.open.loads[0]?.name ?? "", runGroup: "", loadGroup: "", hidden: new Set(), redesign: true, poles: state.poles === "map" ? "slow" : state.poles });
     before = null;
     tuner.reset();
@@ -525,7 +562,7 @@ export async function mount(root, transport) {
   // --- keys ---
   root.addEventListener("keydown", onKey);
   function onKey(event) {
-    if (saving.open || shortcuts.open || leaving.open) return;
+    if (root.inert || saving.open || shortcuts.open || leaving.open) return;
     const key = event.key.toLowerCase(), control = event.ctrlKey || event.metaKey;
     const typing = event.target.matches?.("input[type=text], input[type=search], select");
     const typed = event.target.matches?.("input[type=text]") && event.target.value !== event.target.dataset.shown;
@@ -548,6 +585,7 @@ export async function mount(root, transport) {
     panel = createPanel(next, change, (text) => say(text, "error"));
     if (opened.size) for (const box of panel.nodes) box.open = opened.has(box.dataset.group);
     controls.replaceChildren(tuner.node, panel.seek, element("div", { class: "switches" }, element("label", { class: "switch" }, ties, "equal values move together"), ...tail), ...panel.nodes);
+    worst.hidden = !next.runs.includes(WORST);
     runList.fill(next.runs.map((run) => [run, run]));
     loadList.fill(next.loads.map((load) => [load.name, `1 ${load.unit} of ${load.name}`]));
     runGroups.fill(timeGroups(next, true).map((group) => [group.id, group.text]));

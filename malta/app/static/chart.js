@@ -4,9 +4,10 @@
 import { linearTicks, logTicks, tickLabel } from "./numbers.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg";
-const MARGIN = { left: 50, right: 12, top: 8, bottom: 34 };
+const MARGIN = { left: 56, right: 12, top: 8, bottom: 34 };
 const BESIDE = { right: 44, top: 21 }; // of an axis that stands in Hz at the other side of the frame
 const TURN = 2 * Math.PI;
+const LETTER = 6; // px of a letter of a bound's name, at most
 let charts = 0;
 
 export function svg(name, attributes = {}, text = "") {
@@ -63,7 +64,7 @@ const MARKS = {
 //   x, y: {label, min, max, log, hertz}; equal: one scale for both; hertz: of an axis in rad/s, Hz at the other side as well
 //   lines: {name, xs, ys, color, dash, width, faint}; points: {name, xs, ys, mark, color, faint}
 //   handles: {key, x, y, color, label, value, pull(x, y, done)}: dots that can be dragged, or moved by arrow keys
-//   shapes: {kind: "circle" | "band" | "line" | "ray" | "text" | "area", ...}; pick(x, y): what a click does
+//   shapes: {kind: "circle" | "band" | "line" | "ray" | "text" | "area" | "region", ...}; pick(x, y): what a click does
 //   read(line, k): rows of the readout; nearest: "x" along the axis, "xy" the nearest point
 export function createChart(label) {
   const node = document.createElement("div");
@@ -90,7 +91,7 @@ export function createChart(label) {
     if (zoom) [x, y] = [{ ...x, min: zoom.x[0], max: zoom.x[1] }, { ...y, min: zoom.y[0], max: zoom.y[1] }];
     if (view.equal) [x, y] = equalAxes(x, y, right - MARGIN.left, bottom - top);
     return {
-      width, height, right, bottom, top, x, y,
+      width, height, right, bottom, top, x, y, named: [],
       toX: axisScale(x, MARGIN.left, right),
       toY: axisScale(y, bottom, top),
     };
@@ -113,7 +114,7 @@ export function createChart(label) {
     const tick = (t, log, place, d) => group.append(svg("text", { class: "tick", ...place }, tickLabel(t, log)), svg("path", { class: "frame", d }));
     if (x.hertz) {
       for (const t of inHertz(x, (right - MARGIN.left) / 60)) tick(t, x.log, { x: toX(TURN * t), y: top - 6, "text-anchor": "middle" }, `M${toX(TURN * t)} ${top}v4`);
-      group.append(svg("text", { class: "axis", x: MARGIN.left - 8, y: top - 6, "text-anchor": "end" }, "Hz"));
+      group.append(svg("text", { class: "axis", x: MARGIN.left - 20, y: top - 6, "text-anchor": "end" }, "Hz"));
     }
     if (y.hertz) {
       for (const t of inHertz(y, (bottom - top) / 36)) tick(t, y.log, { x: right + 4, y: toY(TURN * t) + 3.5, "text-anchor": "start" }, `M${right} ${toY(TURN * t)}h-4`);
@@ -123,6 +124,9 @@ export function createChart(label) {
     group.append(svg("text", { class: "axis", transform: `translate(11 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, y.label));
   }
 
+  // A region that a requirement excludes is hatched where a curve enters it.
+  const look = (shape) => (shape.fails ? { class: `${shape.class} hatched`, fill: `url(#${clip}-hatch)` } : { class: shape.class });
+
   function drawShape(group, shape, s) {
     const { toX, toY, right, bottom, x, y } = s;
     if (shape.kind === "area") { // rings of points, the first outside, others holes
@@ -130,9 +134,21 @@ export function createChart(label) {
       group.append(svg("path", { class: shape.class, d, "fill-rule": "evenodd" }));
       return;
     }
+    if (shape.kind === "region") { // x, y: [from, to], null: to the edge; what lies outside is cut off
+      const ends = (side, axis) => [Math.max(side[0] ?? axis.min, axis.min), Math.min(side[1] ?? axis.max, axis.max)];
+      const [[left, to], [low, high]] = [ends(shape.x, x), ends(shape.y, y)];
+      if (left < to && low < high) {
+        const words = shape.text ? `${shape.text}${shape.fails ? " FAILS" : ""}` : "";
+        const place = shape.row === undefined ? { x: right - 4, y: toY(low) - 4, "text-anchor": "end" } : { ...(toX(left) + LETTER * words.length > right ? { x: right - 4, "text-anchor": "end" } : { x: toX(left) + 4 }), y: Math.max(shown.top + 12 + 11 * shape.row, toY(low) - toY(high) > 13 ? toY(high) + 11 : 0) };
+        group.append(svg("rect", { ...look(shape), x: toX(left), y: toY(high), width: toX(to) - toX(left), height: toY(low) - toY(high) }));
+        group.append(svg("text", { class: `zone asked${shape.fails ? " fails" : ""}`, ...place }, words));
+        s.named.push({ left: place.x - LETTER * words.length, y: place.y });
+      }
+      return;
+    }
     if (shape.kind === "circle") {
       const rx = Math.abs(toX(shape.x + shape.r) - toX(shape.x)), ry = Math.abs(toY(shape.y + shape.r) - toY(shape.y));
-      group.append(svg("ellipse", { class: shape.class, cx: toX(shape.x), cy: toY(shape.y), rx, ry }));
+      group.append(svg("ellipse", { ...look(shape), cx: toX(shape.x), cy: toY(shape.y), rx, ry }));
     } else if (shape.kind === "band") {
       const top = toY(Math.min(shape.to, y.max)), low = toY(Math.max(shape.from, y.min));
       if (low > top) group.append(svg("rect", { class: shape.class, x: MARGIN.left, y: top, width: right - MARGIN.left, height: low - top }));
@@ -156,14 +172,19 @@ export function createChart(label) {
     picture.setAttribute("viewBox", `0 0 ${s.width} ${s.height}`);
     const definitions = svg("defs"), cut = svg("clipPath", { id: clip });
     cut.append(svg("rect", { x: MARGIN.left, y: shown.top, width: Math.max(0, s.right - MARGIN.left), height: Math.max(0, s.bottom - shown.top) }));
-    definitions.append(cut);
+    const hatch = svg("pattern", { id: `${clip}-hatch`, width: 7, height: 7, patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" });
+    hatch.append(svg("rect", { class: "hatch-ground", width: 7, height: 7 }), svg("path", { class: "hatch", d: "M0 0V7" }));
+    definitions.append(cut, hatch);
     const axes = svg("g"), inside = svg("g", { "clip-path": `url(#${clip})` });
     for (const shape of (view.shapes ?? []).filter((one) => one.kind === "band")) drawShape(inside, shape, s);
     const front = svg("g", { "clip-path": `url(#${clip})` });
     drawAxes(axes, s);
+    for (const shape of view.shapes ?? []) if (shape.kind !== "band") drawShape(front, shape, s);
     for (const shape of view.shapes ?? []) {
-      if (shape.kind !== "band") drawShape(front, shape, s);
-      else if (s.toY(shape.from) - s.toY(Math.min(shape.to, s.y.max)) > 11) front.append(svg("text", { class: "zone", x: MARGIN.left + 4, y: s.toY(Math.min(shape.to, s.y.max)) + 10 }, shape.text));
+      if (shape.kind !== "band") continue;
+      const place = { x: MARGIN.left + 4, y: s.toY(Math.min(shape.to, s.y.max)) + 10 };
+      const hides = s.named.some((one) => Math.abs(one.y - place.y) < 11 && one.left < place.x + LETTER * shape.text.length);
+      if (!hides && s.toY(shape.from) - place.y > 1) front.append(svg("text", { class: "zone", ...place }, shape.text));
     }
     for (const line of view.lines ?? []) {
       const mark = { class: `line${line.faint ? " faint" : ""}`, d: pathOf(line.xs, line.ys, s.toX, s.toY), stroke: line.color };
@@ -202,8 +223,8 @@ export function createChart(label) {
   const handleOf = (key) => view.handles?.find((one) => one.key === key);
 
   function makeHandle(key) {
-    const button = document.createElement("button");
-    button.type = "button";
+    const button = document.createElement("span");
+    button.tabIndex = 0;
     button.className = "handle";
     button.setAttribute("role", "slider");
     button.addEventListener("pointerdown", (event) => {

@@ -1,6 +1,6 @@
 // Sliders and number fields of a design: one row an entry, in the unit of its file.
 
-import { digits, printedUnit } from "./numbers.js";
+import { digits, numberIn, printedUnit } from "./numbers.js";
 
 const STEPS = 1000; // of a slider
 const DIGITS = 5; // of a number that a slider sets
@@ -26,8 +26,6 @@ export function element(name, attributes = {}, ...children) {
 
 // A list that opens from a sign.
 export const dropDown = (sign, list) => element("span", { class: "drop" }, element("span", { "aria-hidden": "true" }, sign), list);
-
-const toNumber = (text) => (text.trim() === "" ? NaN : Number(text.trim().replace("−", "-"))); // a comma is refused: 1,000 may be one or a thousand
 
 // Slider position, 0 to STEPS, of a value, and back. With `zero` the left end of a logarithmic slider is 0.
 function positionOf(field, value) {
@@ -63,7 +61,7 @@ export function createRow(field, label, change, fail) {
   });
   if (!slider) name.htmlFor = box.id;
   const enter = () => {
-    const value = toNumber(box.value);
+    const value = numberIn(box.value, field.unit);
     if (box.value === box.dataset.shown) return;
     if (!Number.isFinite(value)) { fail(`${field.key}: found ${JSON.stringify(box.value)}, expected a finite number${unit ? ` in ${unit}` : ""}`); box.setAttribute("aria-invalid", "true"); return; }
     change(value, true);
@@ -120,7 +118,7 @@ export function createPanel(description, change, fail) {
     nodes.push(box);
     all.push(...members);
   }
-  const seek = element("input", { type: "search", class: "seek", placeholder: "find a number: mass, noise, gravity  ( / )", "aria-label": "find a number" });
+  const seek = element("input", { type: "search", class: "seek", placeholder: "find a number: mass, noise ( / )", "aria-label": "find a number" });
   seek.addEventListener("input", () => {
     const text = seek.value.toLowerCase();
     for (const box of nodes) {

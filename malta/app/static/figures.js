@@ -31,8 +31,12 @@ function sizeHandles(frequency, which, rows, hidden, pull) {
   }));
 }
 
+// Regions that requirements exclude of a chart. An entry fails by its judge, or before it by the curves.
+const boundHandles = (limits, place, at) => limits.filter((one) => one.pull).map((one) => ({ key: `bound ${one.entry}`, bound: true, ...at(one), color: "var(--bad)", label: `bound of ${one.words}`, value: one.text, pull: (x, y, done) => one.pull(place(x, y, one), done) }));
+const failed = (limit, state, curve) => state.requirements[limit.entry]?.holds === false || (state.requirements[limit.entry]?.holds !== true && curve);
+
 // |S| or |T| of each sensor, with the zones of ISO 14839-3 behind S; or |L|, the others closed.
-export function sensitivityView(picture, pins, which, hidden, pull) {
+export function sensitivityView(picture, pins, which, hidden, pull, state) {
   const { w, sensors } = picture.frequency;
   const rows = sizesOf(picture.frequency, which);
   const lines = [
@@ -42,11 +46,17 @@ export function sensitivityView(picture, pins, which, hidden, pull) {
   const [low, top] = rangeOf(rows, { log: true });
   const zones = [[0, 3, "A"], [3, 4, "B"], [4, 5, "C"], [5, 1e9, "D"]];
   const shapes = which === "S" ? zones.map(([from, to, name]) => ({ kind: "band", from: Math.max(from, 1e-9), to, text: name === "A" ? "zone A below 3" : name, class: `zone-${name}` })) : [];
+  const asked = state.limits.filter((one) => one.curve === which && which === "S");
+  const regions = asked.map((one) => ({ kind: "region", x: [null, null], y: [one.limit, null], text: `${one.words} ≤ ${one.text}`, class: "asked", fails: failed(one, state, rows.some((row) => Math.max(...row) > one.limit)) }));
+  const band = which === "S" ? [] : state.limits.filter((one) => one.curve === "T").flatMap((one) => {
+    const fails = failed(one, state, false), lines = [{ kind: "line", x: one.high, class: "limit" }, { kind: "text", x: one.high, y: 1, shift: -4, drop: -5, anchor: "end", class: `zone asked${fails ? " fails" : ""}`, text: `${one.words} ≥ ${one.text}${fails ? " FAILS" : ""}` }];
+    return which === "T" ? [{ kind: "region", x: [null, one.high], y: [null, one.limit], class: "asked", fails }, ...lines] : lines;
+  });
   return {
     x: { label: "frequency [rad/s]", min: w[0], max: w[w.length - 1], log: true, hertz: true },
     y: { label: which === "L" ? "|L|, each sensor, others closed" : `|${which}|, each sensor`, min: which === "L" ? Math.max(low, 1e-3) : 0.01, max: which === "L" ? Math.min(top, 1e3) : Math.max(8, top), log: true },
-    handles: sizeHandles(picture.frequency, which, rows, hidden, pull),
-    lines, shapes: [...shapes, { kind: "line", y: 1 }], nearest: "x",
+    handles: [...sizeHandles(picture.frequency, which, rows, hidden, pull), ...boundHandles(asked, (_, y) => Math.max(y, 1.001), (one) => ({ x: 2 * w[0], y: one.limit }))],
+    lines, shapes: [...shapes, ...regions, ...band, { kind: "line", y: 1 }], nearest: "x",
     summary: rows.length ? sensors.map((name, k) => `${name}: largest ${digits(Math.max(...rows[k]), 3)}`).join(", ") : "unstable: no sensitivity",
     empty: rows.length ? "" : "An unstable loop has no sensitivity.",
     read: (line, k) => [
@@ -57,13 +67,15 @@ export function sensitivityView(picture, pins, which, hidden, pull) {
 }
 
 // The loop of each sensor with the others closed, about -1; the disk inside of which |S| is above 3.
-export function nyquistView(picture, pins, reach, hidden, pull) {
+export function nyquistView(picture, pins, reach, hidden, pull, state) {
   const { w, sensors, L } = picture.frequency;
   const curves = (frequency, ghost) => frequency.sensors.map((name, k) => ({
     name, w: frequency.w, xs: frequency.L[k][0], ys: frequency.L[k][1], color: color(k),
     dash: dash(k), faint: ghost, silent: ghost,
   })).filter((line) => !hidden.has(line.name));
   // A handle stands where a loop enters the unit circle; round the circle its phase margin changes.
+  const peaks = sizesOf(picture.frequency, "S");
+  const circles = state.limits.filter((one) => one.curve === "S").map((one) => ({ limit: one, fails: failed(one, state, peaks.some((row) => Math.max(...row) > one.limit)) }));
   const handles = sensors.flatMap((name, k) => {
     const crossing = picture.frequency.crossover[k];
     if (hidden.has(name) || !crossing) return [];
@@ -76,13 +88,13 @@ export function nyquistView(picture, pins, reach, hidden, pull) {
     y: { label: "Im", min: -reach, max: reach },
     shapes: [
       { kind: "circle", x: 0, y: 0, r: 1, class: "unit" },
-      { kind: "circle", x: -1, y: 0, r: 1 / 3, class: "forbidden" },
+      ...(circles.length ? circles.map(({ limit, fails }) => ({ kind: "circle", x: -1, y: 0, r: 1 / limit.limit, class: "asked", fails })) : [{ kind: "circle", x: -1, y: 0, r: 1 / 3, class: "forbidden" }]),
       { kind: "line", x: 0 }, { kind: "line", y: 0 },
       { kind: "text", x: -1, y: 0, text: "+", drop: 3.5 },
-      { kind: "text", x: -1, y: 1 / 3, text: "|S| > 3", drop: -4 },
+      ...(circles.length ? circles.map(({ limit, fails }) => ({ kind: "text", x: -1, y: -1 / limit.limit, text: `${limit.words} ≤ ${limit.text}${fails ? " FAILS" : ""}`, drop: 12, class: `zone asked${fails ? " fails" : ""}` })) : [{ kind: "text", x: -1, y: 1 / 3, text: "|S| > 3", drop: -4 }]),
     ],
     lines: [...pins.flatMap((pin) => curves(pin.picture.frequency, true)), ...curves(picture.frequency, false)],
-    summary: `${sensors.length} curves from ${digits(w[0], 3)} to ${digits(w[w.length - 1], 3)} rad/s`,
+    summary: `${sensors.length} ${sensors.length > 1 ? "curves" : "curve"} from ${digits(w[0], 3)} to ${digits(w[w.length - 1], 3)} rad/s`,
     read: (line, k) => [
       { text: line.name, strong: true, color: line.color },
       { text: hertz(line.w[k]) },
@@ -170,7 +182,7 @@ export function runView(state, group, hidden, pull) {
   }
   if (group.of === "p") {
     for (const k of group.indices) {
-      if (Math.max(...run.reference[k].map(Math.abs)) > 0) lines.unshift({ name: `${signals[k].name} reference`, xs: run.t, ys: run.reference[k], color: "var(--soft)", dash: "2 2", silent: true, width: 2.4 });
+      if (!hidden.has(signals[k].name) && Math.max(...run.reference[k].map(Math.abs)) > 0) lines.unshift({ name: `${signals[k].name} reference`, xs: run.t, ys: run.reference[k], color: "var(--soft)", dash: "2 2", silent: true, width: 2.4 });
     }
   }
   const handles = group.of === "v" ? [] : group.indices.filter((k) => !hidden.has(signals[k].name)).flatMap((k) => {
@@ -178,7 +190,8 @@ export function runView(state, group, hidden, pull) {
     const from = group.of === "error" ? 0 : run.reference[k][worst];
     return picture.stable && errors[worst] > 0 ? [{ key: name, x: run.t[worst], y: seriesOf(run, group, k)[worst], color: color(k), label: `largest error of ${name}`, value: quantity(errors[worst], group.unit), pull: (_, y, done) => pull("run", name, Math.abs(y - from), done) }] : [];
   });
-  return timeView(lines, group, run.t, run.name, handles);
+  const asked = group.of === "error" ? state.limits.filter((one) => one.curve === "error" && run.name !== "" && one.signals.some((name) => group.indices.some((k) => signals[k].name === name && !hidden.has(name)))) : [];
+  return timeView(lines, group, run.t, run.name, handles, { lines: asked });
 }
 
 // The outputs under a unit of one disturbance.
@@ -194,19 +207,30 @@ export function loadView(state, group, hidden, pull) {
     return { key: name, x: load.t[worst], y: load.y[k][worst], color: color(k), label: `most that ${load.name} moves ${name}`, value: quantity(load.largest[k], group.unit), pull: (_, y, done) => pull("load", name, Math.abs(y), done) };
   });
   const most = Math.max(0, ...handles.map((one) => Math.abs(one.y)));
-  return timeView(lines, group, load.t, `load ${load.name}`, handles.filter((one) => Math.abs(one.y) > 1e-3 * most));
+  const signals = group.indices.map((k) => description.outputs[k].name).filter((name) => !hidden.has(name));
+  const asked = state.limits.filter((one) => one.curve === "load" && one.load === load.name && one.signals.some((name) => signals.includes(name)) && one.low < load.t[load.t.length - 1]).sort((one, other) => other.limit - one.limit);
+  const beyond = (one) => group.indices.some((k) => signals.includes(description.outputs[k].name) && one.signals.includes(description.outputs[k].name) && load.y[k].some((y, i) => load.t[i] >= one.low && Math.abs(y) > one.limit));
+  return timeView(lines, group, load.t, `load ${load.name}`, handles.filter((one) => Math.abs(one.y) > 1e-3 * most), { regions: asked.map((one) => ({ ...one, fails: failed(one, state, beyond(one)) })) });
 }
 
-function timeView(lines, { unit, words }, times, title, handles) {
-  const [low, high] = rangeOf(lines.map((line) => line.ys), { zero: true });
+function timeView(lines, { unit, words }, times, title, handles, { regions = [], lines: bounds = [] } = {}) {
+  let [low, high] = rangeOf(lines.map((line) => line.ys), { zero: true });
+  const side = high >= -low ? 1 : -1, most = Math.max(0, ...regions.map((one) => 1.12 * one.limit));
+  [low, high] = side > 0 ? [low, Math.max(high, most)] : [Math.min(low, -most), high];
   const size = Math.max(Math.abs(low), Math.abs(high)), value = scaleFor(size, unit), time = scaleFor(times[times.length - 1], "s");
+  const shapes = [...regions.map((one, k) => {
+    const above = Math.min(Infinity, ...regions.slice(0, k).filter((other) => other.low <= one.low).map((other) => other.limit));
+    const ends = [one.limit / value.factor, above < Infinity ? above / value.factor : null];
+    return { kind: "region", x: [one.low / time.factor, null], y: side > 0 ? ends : [ends[1] === null ? null : -ends[1], -ends[0]], text: `${one.words} ≤ ${one.text}`, class: "asked", fails: one.fails, row: k };
+  }), ...bounds.flatMap((one) => [1, -1].map((sign) => ({ kind: "line", y: (sign * one.limit) / value.factor, class: "limit" }))), ...bounds.map((one) => ({ kind: "text", x: 0, y: one.limit / value.factor, shift: 4, drop: -3, anchor: "start", class: "zone asked", text: `${one.words} ≤ ${one.text}, of machines that differ` }))];
   const scaled = lines.map((line) => ({ ...line, xs: line.xs.map((t) => t / time.factor), ys: line.ys.map((y) => (y === null ? null : y / value.factor)) }));
   return {
     nearest: "x",
     x: { label: `time [${time.unit}]`, min: 0, max: times[times.length - 1] / time.factor },
     y: { label: `${words} [${value.unit || "1"}]`, min: low / value.factor, max: high / value.factor },
-    lines: scaled, shapes: [{ kind: "line", y: 0 }],
-    handles: distinct(handles.map((one) => ({ ...one, x: one.x / time.factor, y: one.y / value.factor, pull: (x, y, done) => one.pull(x, y * value.factor, done) }))),
+    lines: scaled, shapes: [...shapes, { kind: "line", y: 0 }],
+    handles: [...distinct(handles.map((one) => ({ ...one, x: one.x / time.factor, y: one.y / value.factor, pull: (x, y, done) => one.pull(x, y * value.factor, done) }))),
+      ...boundHandles(regions, (_, y, one) => Math.abs(y) * value.factor * (one.asked / one.limit), (one) => ({ x: Math.max(one.low, 0.94 * times[times.length - 1]) / time.factor, y: (side * one.limit) / value.factor }))],
     summary: `${title}: ${words}, largest ${quantity(size, unit)}`,
     read: (line, k) => [
       { text: `${digits(line.xs[k], 4)} ${time.unit}`, strong: true },
@@ -233,11 +257,11 @@ export function mapView(state, pick) {
   const told = there ? `there ${there.stable ? "stable" : "UNSTABLE"}${moved ? `, worst with${moved}` : ""}, slowest pole ${digits(there.worst[0], 4)}${there.worst[1] ? ` ± ${digits(Math.abs(there.worst[1]), 4)} j` : ""} rad/s` : "click for the poles there";
   return {
     nearest: "xy", pick: (x, y) => pick(...(near(x, y) ? witness : [x, y])),
-    x: { label: `${map.x}${unit(0)}`, min: map.reach[0][0], max: map.reach[0][1] }, y: { label: `${map.y}${unit(1)}`, min: map.reach[1][0], max: map.reach[1][1] },
+    x: { label: `${map.words[0]}${unit(0)}`, min: map.reach[0][0], max: map.reach[0][1] }, y: { label: `${map.words[1]}${unit(1)}`, min: map.reach[1][0], max: map.reach[1][1] },
     shapes: [...map.unstable.map((rings) => ({ kind: "area", rings, class: "forbidden" })), ...(lower > 0 ? [{ kind: "area", rings: box(lower), class: "proven-box" }] : []), { kind: "area", rings: box(1), class: "asked-box" }],
     lines: map.boundary.map(([xs, ys]) => ({ name: "boundary", xs, ys, color: "var(--ink)", silent: true })), points,
     note: `${[map.version !== state.version ? "of the last design" : lower > 0 ? `blue: proven, ${proof.proven} of the dashed box` : picture.margin ? "not proven (yet)" : "", map.beside].filter(Boolean).join(", ")}; ${told}`,
-    summary: `${map.x} and ${map.y}${map.beside ? `, ${map.beside}` : ""}; ${told}`,
+    summary: `${map.words[0]} and ${map.words[1]}${map.beside ? `, ${map.beside}` : ""}; ${told}`,
     read: (set, k) => [{ text: set.name, strong: true, color: set.color }, { text: `${map.x} ${digits(set.xs[k], 4)}` }, { text: `${map.y} ${digits(set.ys[k], 4)}` }],
   };
 }

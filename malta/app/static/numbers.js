@@ -20,6 +20,26 @@ export function scaleFor(size, unit) {
   return { factor, unit: prefix + printedUnit(unit) };
 }
 
+const SCALES = { T: 1e12, G: 1e9, M: 1e6, k: 1e3, "": 1, m: 1e-3, u: 1e-6, n: 1e-9, p: 1e-12 };
+const BASES = [...PLAIN, "g", "ohm", "Wb", "T"].filter((base) => !/[ /^]/.test(base));
+
+// A unit as its size and what it is of: "um s" is 1e-6 of "m s".
+export function sizeOf(unit) {
+  const plain = unit.trim().replace(/[µμ]/g, "u").replace(/Ω/g, "ohm").replace(/²/g, "^2");
+  const [, head, tail] = /^([A-Za-z]*)(.*)$/.exec(plain), base = BASES.find((one) => head.endsWith(one) && head.slice(0, -one.length) in SCALES);
+  return base && !tail.startsWith("^") ? [SCALES[head.slice(0, -base.length)], base + tail] : [1, plain];
+}
+
+// The number that is typed for a field, its unit behind it or not: "12 um", "0.012 mm". NaN for what is none; a comma is
+// refused, since 1,000 may be one or a thousand.
+export function numberIn(text, unit) {
+  const found = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(.*?)\s*$/i.exec(text.replace("−", "-"));
+  if (!found) return NaN;
+  const [typed, own] = [sizeOf(found[2]), sizeOf(unit)];
+  if (!found[2]) return Number(found[1]);
+  return typed[1] === own[1] ? Number((Number(found[1]) * (typed[0] / own[0])).toPrecision(12)) : NaN;
+}
+
 // A number with so many digits, without an exponent where that is short.
 export function digits(value, count = 4) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";

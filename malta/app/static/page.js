@@ -10,10 +10,11 @@ async function ask(body) {
   return answer.json();
 }
 
-async function listen(hear) {
+async function listen(hear, page) {
   for (let after = 0, failures = 0; failures < 5; ) {
     try {
-      const found = await ask({ ask: "news", after });
+      const found = await ask({ ask: "news", after, page });
+      if (found.lost) { hear({ kind: "lost", text: found.lost }); return; }
       after = found.after;
       failures = 0;
       found.news.forEach(hear);

@@ -52,8 +52,6 @@ export function countLights(description, state) {
   return counts;
 }
 
-const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(b));
-
 // A single column has room for Hz beside rad/s.
 function figureRows(figures, proof, margin, alone = false) {
   const upper = proof?.upper ?? margin?.upper, lost = proof?.upper ? proof.lost : margin?.lost;
@@ -71,10 +69,10 @@ export function figureTable(state) {
   const head = element("tr", {}, element("th", {}, ""), ...columns.map((column) => element("th", { scope: "col", class: "number" }, column.name)));
   const body = labels.map((label) => {
     const cells = columns.map((column) => column.rows.find((row) => row.label === label));
-    const values = cells.filter(Boolean).map((cell) => cell.value).filter((value) => value !== null);
-    const side = cells.find(Boolean).better, best = side > 0 ? Math.max(...values) : Math.min(...values);
+    const known = cells.filter((cell) => cell && cell.value !== null), side = cells.find(Boolean).better;
+    const best = known.reduce((one, other) => (side * other.value > side * one.value ? other : one), known[0])?.text; // ties are of the digits that are shown
     return element("tr", {}, element("th", { scope: "row" }, label), ...cells.map((cell) => {
-      const wins = cell && side && values.length > 1 && near(cell.value, best) && !values.every((value) => near(value, best));
+      const wins = cell && side && cell.text === best && !known.every((one) => one.text === best);
       return element("td", { class: `number${wins ? " better" : ""}${cell?.old ? " old" : ""}`, title: cell?.note ?? "" }, cell ? (wins ? "★ " : "") + cell.text : "–");
     }));
   });

@@ -1,7 +1,7 @@
 // Designs from where the page stands: candidates of a search, and the front of margin against noise under one slider.
 
 import { element } from "./controls.js";
-import { digits, percent, quantity } from "./numbers.js";
+import { digits, quantity } from "./numbers.js";
 
 const SHOWN = 6; // candidates at once, the newest
 const STARTS = { tune: "tuning from here…", front: "computing the front…" };
@@ -20,6 +20,9 @@ export const pointText = (point) => {
   const price = priceOf(point), missed = point.limit ? `, misses ${boundWords(point.limit)} by ${digits(100 * (point.ratio - 1), 2)} %` : "";
   return `${point.proven} proven · ${quantity(price.value, price.unit)} ${price.label.split(" [")[0]}${missed}`;
 };
+
+// What a candidate misses most, or is nearest to: its ratio is at most 1 where all hold.
+export const limitText = ({ name, limit, ratio }) => `${name}  ${ratio > 1 ? `misses ${boundWords(limit)} by ${digits(100 * (ratio - 1), 2)} %` : `holds all${limit ? `, nearest ${boundWords(limit)}` : ""}`}`;
 
 // state.candidates are drawn beside the design. ask(document) -> promise; place(values, done) moves the design to others.
 export function createTuner(state, { ask, place, say, redraw }) {
@@ -74,7 +77,7 @@ export function createTuner(state, { ask, place, say, redraw }) {
     trade.textContent = `Margin against ${state.description.law === "PID" ? "load" : "noise"}`;
     stop.hidden = !found.running;
     clear.hidden = !state.candidates.length && !state.front.length;
-    list.replaceChildren(...state.candidates.slice(-SHOWN).map((one) => button(`${one.name}  ${percent(one.ratio)} of ${boundWords(one.limit)}`, "take this design: nearest to its limit, or furthest beyond it, is what stands here", () => place(one.values, true))));
+    list.replaceChildren(...state.candidates.slice(-SHOWN).map((one) => button(limitText(one), "take this design; the words name the requirement that it misses most, or is nearest to", () => place(one.values, true))));
     master.hidden = state.front.length < 2;
     if (master.hidden) return;
     const same = (one) => Object.entries(one.values).every(([key, value]) => state.values[key] === value);

@@ -340,11 +340,18 @@ MERITS = "figures of merit; a key ends in its SI unit, and in _share where 0.01 
 class CasePart(DocumentPart):
     """A run of an experiment."""
 
-    READS: ClassVar = {"verdict": "run.verdict", "limits": "run.limits"}
+    READS: ClassVar = {
+        "verdict": "run.verdict",
+        "limits": "run.limits",
+        "integration_error": "run.integration_error",
+    }
 
     label: str
     verdict: End
     limits: list[str] = Field(description="limits of the machine that the run met")
+    integration_error: Number = Field(
+        default=None, description="bound for every output, m or rad; null: not known"
+    )
     merits: dict[str, Number] = Field(description=MERITS)
 
 

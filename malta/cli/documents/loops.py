@@ -17,6 +17,7 @@ from malta.units import distinct
 if TYPE_CHECKING:
     from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
+    from malta.margins.unmodelled import UnmodelledMargin
     from malta.report.page.comparison import Comparison
 
 
@@ -207,6 +208,18 @@ class WorstGainPart(DocumentPart):
     reason: str
 
 
+class UnmodelledPart(MarginPart):
+    """The margin of parameters and of the dynamics that a log leaves, together."""
+
+    READS: ClassVar = MARGIN_FIELDS
+
+    needed: Number = Field(description="margin with which the box holds all parameters together")
+    covers: bool = Field(description="whether it is proven to be larger than needed")
+    weight: dict[str, float] = Field(description="|W|, by rad/s")
+    order: int = Field(description="of W")
+    assumed: str = Field(description="what the bound of the dynamics is assumed for")
+
+
 class RobustPart(DocumentPart):
     """Margins over an uncertainty and over the travel."""
 
@@ -223,6 +236,9 @@ class RobustPart(DocumentPart):
     places: list[PlacePart]
     worst_sensitivity: dict[str, WorstGainPart] = Field(
         description="largest |S| over the uncertainty; {}: not asked"
+    )
+    unmodelled: UnmodelledPart | None = Field(
+        default=None, description="with --identified: dynamics that the machine lacks; null: not asked"
     )
 
 
@@ -245,6 +261,7 @@ class DeviationPart(DocumentPart):
 
     unit: str
     largest: Number
+    any_waveform: Number = Field(description="at most, under a load of this amplitude and of any waveform")
     left: list[LeftPart]
     settled_s: Number
     final: Number
@@ -318,9 +335,15 @@ def verify_output(gains: Path, found: LoopReport, files: Sequence[Path]) -> Veri
         },
         tolerance={name: {"down": down, "up": up} for name, (down, up) in found.tolerance.items()},
         places=[PlacePart.of(place, unit=unit) for place in found.places],
+        unmodelled=None if found.unmodelled is None else _unmodelled_part(found.unmodelled),
     )
     own = {"gains": gains, "files": files, "robust": robust}
     return VerifyOutput.of(found, **loop_fields(found) | own, recovery=[_recovery(r) for r in found.recovery])
+
+
+def _unmodelled_part(found: UnmodelledMargin) -> UnmodelledPart:
+    """The margin with unmodelled dynamics."""
+    return UnmodelledPart.of(found, weight={f"{w:.6g}": size for w, size in found.sizes.items()})
 
 
 def _recovery(found: Recovery) -> RecoveryPart:
@@ -372,12 +395,24 @@ class ComparedFigure(DocumentPart):
     best: list[str] = Field(description="designs whose value is the better one; none of a tie")
 
 
+class DesignStanding(DocumentPart):
+    """Whether a design is better or worse than the reference, by the same requirements."""
+
+    READS: ClassVar = {"design": "label", "verdict": "value", "where": "note"}
+
+    design: str
+    verdict: str
+    where: str = Field(description="what it misses, and where it is better and worse")
+
+
 class CompareOutput(DocumentPart):
     """What `malta compare --json` prints."""
 
     kind: Literal["malta-compare-output"] = Field(default="malta-compare-output", alias="schema")
     version: Literal[1] = 1
     designs: list[ComparedDesign]
+    specification: str | None = Field(description="the design file whose requirements judge all; null: none")
+    standings: list[DesignStanding] = Field(description="of each design; none without a specification")
     differences: dict[str, list[Any]] = Field(description="what the designs do not share, one entry a design")
     figures: list[ComparedFigure]
     remarks: list[str] = Field(description="what could not be compared, and why")
@@ -400,4 +435,12 @@ def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:
         row.key: [None if entry is None else entry.value for entry in row.entries]
         for row in found.differences
     }
-    return CompareOutput.of(found, designs=designs, differences=differences, figures=figures, files=files)
+    return CompareOutput.of(
+        found,
+        designs=designs,
+        specification=None if found.spec is None else str(found.spec.path),
+        standings=[DesignStanding.of(one) for one in found.standings],
+        differences=differences,
+        figures=figures,
+        files=files,
+    )

@@ -17,7 +17,8 @@ from malta.units import identifier
 if TYPE_CHECKING:
     from malta.checker.file import StabilityClaim
     from malta.identification.dump import ExactReplay
-    from malta.identification.identify import Identified
+    from malta.identification.frequency_response import ResponseComparison
+    from malta.identification.identified import Identified
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
@@ -255,7 +256,7 @@ class SignalStatistics(DocumentPart):
 class LogOutput(DocumentPart):
     """What `malta log --json` prints."""
 
-    READS: ClassVar = {"log": "source", "jitter_s": "survey.jitter", "findings": "survey.findings"}
+    READS: ClassVar = {"log": "source", "jitter_s": "survey.jitter"}
 
     kind: Literal["malta-log-output"] = Field(default="malta-log-output", alias="schema")
     version: Literal[1] = 1
@@ -269,6 +270,7 @@ class LogOutput(DocumentPart):
     signals: dict[str, SignalStatistics]
     jitter_s: float
     findings: list[str]
+    notes: list[str] = Field(default=[], description="what reading made of the file")
     files: Files
 
 
@@ -277,8 +279,12 @@ class IdentifiedParameter(DocumentPart):
 
     unit: str
     value: float
-    low: float = Field(description="end of the 95 % interval")
+    low: float = Field(description="end of the total 95 % interval")
     high: float
+    noise_half: Number | None = Field(
+        default=None,
+        description="half of the 95 % interval that noise alone leaves; null: low to high is that",
+    )
     start: float = Field(description="value of the gain file")
     in_time: Number | None = Field(
         default=None, description="from prediction errors in time; null: not estimated"
@@ -286,6 +292,20 @@ class IdentifiedParameter(DocumentPart):
     apart_sigma: Number | None = Field(
         default=None, description="of the two estimates, in standard deviations"
     )
+
+
+class ExplainedBy(DocumentPart):
+    """An imperfection that explains a part of a log."""
+
+    READS: ClassVar = {"usual": "size"}
+
+    name: str
+    unit: str
+    value: float
+    half: float = Field(description="of the 95 % interval")
+    usual: float = Field(description="standard deviation before the log")
+    share: float = Field(description="of what the parameters alone leave")
+    alike: list[str] = Field(description="imperfections that explain as much")
 
 
 class IdentifyOutput(DocumentPart):
@@ -305,6 +325,12 @@ class IdentifyOutput(DocumentPart):
     dof: int
     whiteness: float = Field(description="correlation of neighbouring lines, in standard deviations")
     distortion: Number = Field(description="power where nothing was excited, over the noise")
+    verdict: str
+    explained_by: list[ExplainedBy]
+    left: float = Field(description="share of the response at the lines that nothing explains")
+    loop_error: Number | None = Field(
+        default=None, description="of |S| predicted, beside its band, as a share; null: not measured"
+    )
     refusal: str = Field(description='why the model does not explain the log; "": it does')
     drive: dict[str, IdentifiedParameter] | None = Field(
         default=None, description="R, L and dead time of the drive; null: not asked for"
@@ -320,10 +346,15 @@ class LearnOutput(DocumentPart):
     gains: Name
     log: Name
     factor: float
-    deviation: float = Field(description="standard deviation of the factor")
+    deviation: float = Field(description="standard deviation of the factor by noise")
+    half: float = Field(description="of its 95 % interval, by noise and an unknown load along the stroke")
+    at_limit: float = Field(description="share of the samples in which the thrust was at its limit")
     parameter: str
     before: float
     after: float
+    half_after: float = Field(
+        description="of its total 95 % interval, with mass and gains of sensors as usual"
+    )
     files: Files
 
 
@@ -455,6 +486,24 @@ class MeasurePlanOutput(DocumentPart):
     current_A: dict[str, float] = Field(description="largest deviation of each current from that at rest")
 
 
+class ResponseOutput(DocumentPart):
+    """What `malta measure GAINS --response FILE --json` prints."""
+
+    kind: Literal["malta-response-output"] = Field(default="malta-response-output", alias="schema")
+    version: Literal[1] = 1
+    gains: Name
+    file: str
+    response: str = Field(description='which one, as "S x1"')
+    frequency_Hz: list[float]
+    measured: list[float] = Field(description="magnitude, SI")
+    predicted: list[float] = Field(description="magnitude, SI")
+    low: list[float] = Field(description="least predicted magnitude of the machines")
+    high: list[float]
+    error: list[float] = Field(description="of the complex value, over the predicted magnitude")
+    machines: int = Field(description="of the box, that were sampled for low and high")
+    refusal: str = Field(description='why the response is not as predicted; "": it is')
+
+
 class CommissionFinding(DocumentPart):
     """A figure of a step, with half of its 95 % interval and its limits."""
 
@@ -497,14 +546,15 @@ class CommissionOutput(DocumentPart):
     files: Files
 
 
-def log_output(log: Log, files: Iterable[Path]) -> LogOutput:
-    """The document of a log."""
+def log_output(log: Log, files: Iterable[Path], beyond: Iterable[str] = ()) -> LogOutput:
+    """The document of a log; `beyond` are findings about its machine."""
     signals = {}
     for heading, numbers in log.survey.statistics.items():
         name, _, unit = heading.partition(" [")
         fields = dict(zip(("least", "mean", "largest", "deviation"), numbers, strict=True))
         signals[name.replace(".", "_")] = SignalStatistics(unit=unit[:-1], **fields)
-    return LogOutput.of(log, signals=signals, files=files)
+    findings = [*log.survey.findings, *beyond]
+    return LogOutput.of(log, signals=signals, findings=findings, files=files)
 
 
 def identify_output(
@@ -531,6 +581,7 @@ def identify_output(
             value=float(found.values[k]),
             low=found.intervals[name][0],
             high=found.intervals[name][1],
+            noise_half=float(found.half_widths[k]),
             start=float(found.start[k]),
             in_time=in_time.get(name),
             apart_sigma=found.differences.get(name),
@@ -538,8 +589,17 @@ def identify_output(
         for k, name in enumerate(found.names)
     }
     refusal = found.refusal or ("" if windings is None else windings.refusal)
+    e = found.explanation
     return IdentifyOutput.of(
-        found, gains=gains, parameters=parameters, refusal=refusal, drive=drive, files=files
+        found,
+        gains=gains,
+        parameters=parameters,
+        refusal=refusal,
+        drive=drive,
+        files=files,
+        explained_by=[] if e is None else [ExplainedBy.of(one) for one in e.causes],
+        left=0.0 if e is None else e.share,
+        loop_error=None if found.loop is None else found.loop.error,
     )
 
 
@@ -607,6 +667,19 @@ def _curve(curve: Curve, *at: int) -> MeasuredCurve:
     tables = {"measured": one.size, "deviation": one.deviation, "predicted": abs(one.predicted)}
     tables |= {"low": one.low, "high": one.high}
     return MeasuredCurve(**{name: table.tolist() for name, table in tables.items()})
+
+
+def response_output(gains: Path, path: Path, found: ResponseComparison) -> ResponseOutput:
+    """The document of a response of an analyser beside the predicted one."""
+    return ResponseOutput.of(
+        found,
+        gains=gains,
+        file=str(path),
+        response=found.of,
+        frequency_Hz=(found.response.w / (2 * math.pi)).tolist(),
+        measured=abs(found.response.values).tolist(),
+        predicted=abs(found.predicted).tolist(),
+    )
 
 
 def measure_plan_output(gains: Path, plan: MeasurementPlan) -> MeasurePlanOutput:

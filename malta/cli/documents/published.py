@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from malta.cli.documents import campaigns, loops, others, plots
+from malta.cli.documents import campaigns, loads, loops, others, plots
 from malta.cli.documents.loops import DocumentPart
 from malta.errors import InputError
 from malta.schemas import SCHEMAS
@@ -14,13 +14,13 @@ from malta.schemas.files import DRAFT
 
 # Each stands for the document that `malta NAME --json` prints, or one of its subcommands.
 NAMES = (
-    "design", "verify", "check", "simulate", "campaign", "status", "rare", "sobol", "tolerance", "tune", "excite",
-    "log", "identify", "learn", "learned-strokes", "learned-v0", "replay", "measure", "measure-plan", "commission",
-    "plot", "report", "compare", "export", "pil", "claims", "inspect",
+    "design", "verify", "loads", "check", "simulate", "campaign", "status", "rare", "sobol", "tolerance", "tune",
+    "excite", "log", "identify", "learn", "learned-strokes", "learned-v0", "replay", "measure", "measure-plan",
+    "response", "commission", "plot", "report", "compare", "export", "pil", "claims", "inspect",
 )  # fmt: skip
 _KINDS = {
     str(model.model_fields["kind"].default): model
-    for module in (campaigns, loops, others, plots)
+    for module in (campaigns, loads, loops, others, plots)
     for model in vars(module).values()
     if isinstance(model, type) and issubclass(model, DocumentPart) and "kind" in model.model_fields
 }

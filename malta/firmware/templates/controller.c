@@ -3,6 +3,10 @@
 
 #include <stdbool.h>
 {% include "exact.c" %}
+{% if fma %}
+
+{% include "fused.c" %}
+{% endif %}
 
 {% include "arithmetic.c" %}
 

@@ -48,16 +48,47 @@ extern const {{ name }}_parameters {{ name }}_default_parameters;
 /* The checksum that belongs to a record of parameters, to be written into its member `checksum`. */
 uint32_t {{ name }}_checksum(const {{ name }}_parameters *p);
 
-/* 1 where the checksum of a record fits and every number is in its range: limits and references at most those of the gain
-   file, monitors at least as strict, and gains as follows.
+/* Why a record is refused. */
+#define {{ NAME }}_PARAMETERS_TAKEN 0    /* it is not */
+#define {{ NAME }}_PARAMETERS_NONE 1     /* there is none */
+#define {{ NAME }}_PARAMETERS_CHECKSUM 2 /* its checksum is another one: it changed in its memory */
+#define {{ NAME }}_PARAMETERS_RANGE 3    /* the number `entry` of the record, from 0 on, is out of its range */
+{% if factors %}
+#define {{ NAME }}_PARAMETERS_FACTOR 4   /* gains are not those of the gain file times a factor for each axis */
+{% endif %}
+#define {{ NAME }}_PARAMETERS_BUSY 5     /* the one before waits for its sample */
+
+/* Why a record of parameters is refused, and which of its numbers; entry is -1 where it is none.
+   Limits and references are at most those of the gain file, monitors at least as strict, and gains as follows.
 {% for line in gain_lines %}
    {{ line }}
 {% endfor %} */
-int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p);
+int32_t {{ name }}_refuses_parameters(const {{ name }}_parameters *p, int32_t *entry);
+int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p); /* 1 where it is not */
 
-/* Another record, in memory of the caller, from the next step on; 1, or 0 and nothing changes where it is not accepted.
+/* Another record, in memory of the caller, from the next step on; 1, or 0 and nothing changes where it is refused.
    Change a copy, and set it between two steps: a step reads the record while it computes. */
 int32_t {{ name }}_set_parameters({{ name }}_state *s, const {{ name }}_parameters *p);
+
+/* Parameters that change while the law runs: a tool writes `working`, a commit checks it, and a sample takes it. */
+typedef struct {
+  {{ name }}_parameters working;
+  {{ name }}_parameters pages[2]; /* one in use, and one that is checked */
+  volatile int32_t ready;         /* 1: the other page waits for a sample */
+  int32_t used;                   /* page in use */
+  int32_t reason;                 /* of the last commit */
+  int32_t entry;
+  int32_t commits;                /* that a sample has taken */
+} {{ name }}_calibration;
+
+void {{ name }}_calibration_init({{ name }}_calibration *c);
+
+/* Checks a copy of a record, or of that of the gain file where there is none, beside the law; why it is refused. Its
+   checksum is computed here. The next sample of a supervisor with this `calibration` takes it. */
+int32_t {{ name }}_calibration_commit({{ name }}_calibration *c, const {{ name }}_parameters *p);
+
+/* At the begin of a sample, without a check: what a commit has checked. */
+void {{ name }}_calibration_take({{ name }}_calibration *c, {{ name }}_state *s);
 {% endif %}
 
 /* 1 where the compiled arithmetic is that of the text, which no macro shows; 0: compile it again, without

@@ -24,7 +24,7 @@ static int32_t wait_for_timer(int32_t *missed) {
 static void read_sensors(stand_in *m, const {{ name }}_supervisor *sup, const {{ name }}_state *s,
                          const {{ name }}_outputs *last, {{ name }}_real raw[{{ outputs }}], {{ name }}_inputs *in) {
   int32_t k;
-{% if driven %}
+{% if driven or model is defined %}
   read_stand_in(m, sup->enable, s, last, in);
 {% else %}
   (void)last;
@@ -108,6 +108,9 @@ int main(void) {
 {% endif %}
   {{ name }}_init(&state);
   {{ name }}_supervisor_init(&supervisor);
+{% if wiring %}
+  supervisor.wired = 1; /* the stand-in has no wiring: remove this line, and the wiring is tried before the first lift-off */
+{% endif %}
 {% if logged %}
   {{ name }}_log_init(&log, &state, {{ NAME }}_LOG_ROWS / 2);
 {% endif %}

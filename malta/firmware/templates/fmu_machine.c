@@ -20,7 +20,7 @@ static const {{ name }}_real own_v0[{{ points * forces }}] = {
 {% endif %}
 {{ functions }}
 /* v0(z), linear between the points of the table and constant beyond them. */
-static void look_up({{ name }}_real z, {{ name }}_real v0[{{ forces }}]) {
+static void look_up_own({{ name }}_real z, {{ name }}_real v0[{{ forces }}]) {
   const {{ name }}_real bounded = (z < own_z[{{ points - 1 }}]) ? z : own_z[{{ points - 1 }}];
   const {{ name }}_real at = (bounded > own_z[0]) ? bounded : own_z[0];
   {{ name }}_real share;
@@ -35,15 +35,24 @@ static void look_up({{ name }}_real z, {{ name }}_real v0[{{ forces }}]) {
   }
 }
 
+/* Open switches carry no current; the diodes have ended it within a substep. */
+static void end_currents({{ name }}_state *s) {
+  int32_t k;
+  for (k = 0; k < {{ flowing.size }}; k++) {
+    s->state[{{ flowing.at }} + k] = 0.0;
+  }
+}
+
 void {{ name }}_start({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real x[{{ states }}], {{ name }}_real cold{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %}) {
   {{ name }}_real v0[{{ forces }}];
-  look_up({{ at }}, v0);
+  look_up_own({{ at }}, v0);
   {{ call_begin }};
   s->samples = 0.0;
   s->substeps = 0.0;
 }
 
-void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %}) {
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}], int32_t gates{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %}) {
+  static const {{ name }}_real off[{{ held }}] = { {{ off }} };
   {{ name }}_real until;
   {{ name }}_real acting[{{ acting }}];
   int32_t k;
@@ -55,6 +64,15 @@ void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameter
     acting[{{ held }} + k] = {% if delay > 1 %}(late != 0) ? s->under_way[{{ held }} + k] : {% endif %}command[k];
   }
 {% endif %}
+  if (gates == 0) {
+    end_currents(s);
+    for (k = 0; k < {{ held }}; k++) {
+      acting[k] = off[k];
+{% if acting > held %}
+      acting[{{ held }} + k] = off[k];
+{% endif %}
+    }
+  }
 {% if delay %}
   for (k = 0; k < {{ (delay - 1) * held }}; k++) {
     s->under_way[k] = s->under_way[k + {{ held }}];
@@ -67,6 +85,9 @@ void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameter
   until = (s->samples * {{ substeps }}) - {{ tiny }};
   while (s->substeps < until) {
     {{ call_substep }};
+    if (gates == 0) {
+      end_currents(s);
+    }
     s->substeps = s->substeps + 1.0;
   }
 }

@@ -31,8 +31,9 @@ typedef struct {
    loops hold then. */
 void {{ name }}_start({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real x[{{ states }}], {{ name }}_real cold{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %});
 
-/* One sample{% if delay %}; the command acts {{ delay }} later where `late` is not 0, else at once{% endif %}. */
-void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %});
+/* One sample{% if delay %}; the command acts {{ delay }} later where `late` is not 0, else at once{% endif %}. Where `gates` is 0 all switches
+   are open, whatever is commanded: no current flows. */
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}], int32_t gates{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %});
 
 /* What is known of the machine now{% if noises %}, read with so many times the noise of its sensors; a seed gives the noise of simulations{% endif %}. */
 void {{ name }}_look(const {{ name }}_state *s, const {{ name }}_real par[{{ parameters }}]{% if noises %}, {{ name }}_real noise, {{ name }}_real seed{% endif %}, {{ name }}_readings *r);

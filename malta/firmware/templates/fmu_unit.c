@@ -31,6 +31,8 @@ static const struct {
     {{ target }}[k] = {{ "(" ~ kind ~ ")" if kind else "" }}{{ source }};
   }
 {% endmacro %}
+#define STEP_ROUNDING 1e-6 /* of a sample */
+
 static int is_finite(double x) {
   const double difference = x - x;
   return (difference == 0.0) ? 1 : 0;
@@ -294,9 +296,25 @@ static int sample(unit_data *u, const char **message) {
   (void)message;
 {% endif %}
 {% if machine %}
-  {{ plant }}_step(&u->machine, u->value + {{ at.machine | default(0) }}, u->value + {{ at.command }}{% if wrench %}, u->value + {{ at.w }}{% endif %}{% if delay %}, {{ "1" if controller else "(u->value[" ~ at.late ~ "] != 0.0) ? 1 : 0" }}{% endif %});
+  {{ plant }}_step(&u->machine, u->value + {{ at.machine | default(0) }}, u->value + {{ at.command }}, {{ "1" if controller else "(u->value[" ~ at.gates ~ "] >= 0.5) ? 1 : 0" }}{% if wrench %}, u->value + {{ at.w }}{% endif %}{% if delay %}, {{ "1" if controller else "(u->value[" ~ at.late ~ "] != 0.0) ? 1 : 0" }}{% endif %});
   look(u);
 {% endif %}
+  return status;
+}
+
+/* One sample whose inputs are those of its beginning. */
+static int sample_held(unit_data *u, const char **message) {
+  int status;
+  int32_t k;
+  for (k = 0; k < UNIT_VARIABLES; k++) {
+    const double now = u->value[k];
+    u->value[k] = (roles[k] == 'i') ? u->held[k] : now;
+    u->held[k] = now;
+  }
+  status = sample(u, message);
+  for (k = 0; k < UNIT_VARIABLES; k++) {
+    u->value[k] = (roles[k] == 'i') ? u->held[k] : u->value[k];
+  }
   return status;
 }
 {% if checked %}
@@ -318,17 +336,12 @@ int unit_advance(unit_data *u, double from, double step, const char **message) {
   const double whole = step / UNIT_SAMPLE_TIME;
   const double apart = from - u->value[0];
   int status = UNIT_OK;
-  int64_t count;
-  int64_t k;
+  double left = whole;
   if (u->phase != UNIT_RUNNING) {
     return refuse(message, "a step outside of the simulation");
   }
-  if (!((whole > 0.5) && (whole < 1e12))) {
-    return refuse(message, "a step that is no multiple of the sample time");
-  }
-  count = (int64_t)(whole + 0.5);
-  if (!((whole - (double)count < 1e-6) && (whole - (double)count > -1e-6))) {
-    return refuse(message, "a step that is no multiple of the sample time");
+  if (!((whole >= 1e-3) && (whole < 1e12))) {
+    return refuse(message, "a step that is shorter than a thousandth of the sample time, or endless");
   }
   if (!((apart < 1e-3 * UNIT_SAMPLE_TIME) && (apart > -1e-3 * UNIT_SAMPLE_TIME))) {
     return refuse(message, "a step that does not begin where the last one ended");
@@ -338,9 +351,20 @@ int unit_advance(unit_data *u, double from, double step, const char **message) {
     return refuse(message, "an input {{ f.name }} that is no finite number");
   }
 {% endfor %}
-  for (k = 0; k < count; k++) {
-    const int found = sample(u, message);
-    status = (found > status) ? found : status;
+  while (left > STEP_ROUNDING) {
+    const double rest = 1.0 - u->share;
+    if (u->share == 0.0) {
+      memcpy(u->held, u->value, sizeof u->held);
+    }
+    if (left < (rest - STEP_ROUNDING)) {
+      u->share = u->share + left;
+      left = 0.0;
+    } else {
+      const int found = sample_held(u, message);
+      status = (found > status) ? found : status;
+      u->share = 0.0;
+      left = left - rest;
+    }
   }
   u->value[0] = from + step;
 {% if machine %}

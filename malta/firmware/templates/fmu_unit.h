@@ -25,6 +25,8 @@ enum { UNIT_NEW, UNIT_INITIAL, UNIT_RUNNING, UNIT_ENDED };
 /* All that a unit remembers. */
 typedef struct {
   double value[UNIT_VARIABLES]; /* value[0]: time, s */
+  double held[UNIT_VARIABLES];  /* inputs at the beginning of a sample that is under way */
+  double share;                 /* of this sample that is over */
 {% if controller %}
   {{ name }}_state controller;
 {% if tunable %}

@@ -3,6 +3,7 @@
 
 #include <limits.h>
 #include <stdbool.h>
+#include <stddef.h>
 {% include "exact.c" %}
 
 #define ROWS {{ rows | length }} /* of the table of monitors */
@@ -17,9 +18,6 @@
 {% endmacro %}
 
 {{ record("const " ~ name ~ "_parameters " ~ name ~ "_default_parameters", "values", counts, parameter_checksum) }}
-{{ record("static const " ~ name ~ "_parameters least", "least", ones, "0u") }}
-{{ record("static const " ~ name ~ "_parameters most", "most", counts, "0u") -}}
-
 /* FNV-1a over bytes of 8 bits, those of a memory cell from the lowest on. */
 static uint32_t fold(uint32_t sum, uint32_t cell) {
   uint32_t found = sum;
@@ -63,14 +61,17 @@ uint32_t {{ name }}_checksum(const {{ name }}_parameters *p) {
   return found;
 }
 
-/* A NaN is in no interval. */
-static bool are_between(const {{ name }}_real values[], const {{ name }}_real low[], const {{ name }}_real high[], int32_t count) {
-  bool inside = true;
+/* The first of so many numbers that is not in its interval, from `at` on in the record; -1: none. A NaN is in no interval. */
+static int32_t first_outside(const {{ name }}_real values[], const {{ name }}_real low[], const {{ name }}_real high[], int32_t count,
+                             int32_t at) {
+  int32_t found = -1;
   int32_t k;
-  for (k = 0; k < count; k++) {
-    inside = inside && (values[k] >= low[k]) && (values[k] <= high[k]);
+  for (k = count - 1; k >= 0; k--) {
+    if (!((values[k] >= low[k]) && (values[k] <= high[k]))) {
+      found = at + k;
+    }
   }
-  return inside;
+  return found;
 }
 
 {% if factors %}
@@ -97,19 +98,49 @@ static bool have_factors(const {{ name }}_parameters *p) {
 }
 
 {% endif %}
-int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p) {
-  bool accepted = p->checksum == {{ name }}_checksum(p);
+/* The first number of a record that is out of its range, in the order of the record; -1: none. */
+static int32_t out_of_range(const {{ name }}_parameters *p) {
+  {{ record("static const " ~ name ~ "_parameters least", "least", ones, "0u") | indent(2) -}}
+  {{ record("static const " ~ name ~ "_parameters most", "most", counts, "0u") | indent(2) -}}
+  int32_t found = -1;
   int32_t k;
-{% for p in parameters %}
-  accepted = accepted && are_between(p->{{ p.name }}, least.{{ p.name }}, most.{{ p.name }}, {{ p.size }});
-{% endfor %}
-  for (k = 0; k < ROWS; k++) {
-    accepted = accepted && (p->samples[k] >= least.samples[k]) && (p->samples[k] <= most.samples[k]);
+  for (k = ROWS - 1; k >= 0; k--) {
+    if ((p->samples[k] < least.samples[k]) || (p->samples[k] > most.samples[k])) {
+      found = {{ parameters | sum(attribute="size") }} + k;
+    }
   }
+{% set at = namespace(end=parameters | sum(attribute="size")) %}
+{% for p in parameters | reverse %}
+{% set at.end = at.end - p.size %}
+  k = first_outside(p->{{ p.name }}, least.{{ p.name }}, most.{{ p.name }}, {{ p.size }}, {{ at.end }});
+  found = (k >= 0) ? k : found;
+{% endfor %}
+  return found;
+}
+
+int32_t {{ name }}_refuses_parameters(const {{ name }}_parameters *p, int32_t *entry) {
+  int32_t reason = {{ NAME }}_PARAMETERS_NONE;
+  *entry = -1;
+  if (p != NULL) {
+    *entry = out_of_range(p);
+    if (*entry >= 0) {
+      reason = {{ NAME }}_PARAMETERS_RANGE;
 {% if factors %}
-  accepted = accepted && have_factors(p);
+    } else if (!have_factors(p)) {
+      reason = {{ NAME }}_PARAMETERS_FACTOR;
 {% endif %}
-  return accepted ? 1 : 0;
+    } else if (p->checksum != {{ name }}_checksum(p)) {
+      reason = {{ NAME }}_PARAMETERS_CHECKSUM;
+    } else {
+      reason = {{ NAME }}_PARAMETERS_TAKEN;
+    }
+  }
+  return reason;
+}
+
+int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p) {
+  int32_t entry;
+  return ({{ name }}_refuses_parameters(p, &entry) == {{ NAME }}_PARAMETERS_TAKEN) ? 1 : 0;
 }
 
 int32_t {{ name }}_set_parameters({{ name }}_state *s, const {{ name }}_parameters *p) {
@@ -118,4 +149,55 @@ int32_t {{ name }}_set_parameters({{ name }}_state *s, const {{ name }}_paramete
     s->parameters = p;
   }
   return accepted;
+}
+
+/* Entry by entry: a compiler may call memcpy for a record. */
+static void copy_parameters(const {{ name }}_parameters *from, {{ name }}_parameters *to) {
+  int32_t k;
+{% for p in parameters %}
+  for (k = 0; k < {{ p.size }}; k++) {
+    to->{{ p.name }}[k] = from->{{ p.name }}[k];
+  }
+{% endfor %}
+  for (k = 0; k < ROWS; k++) {
+    to->samples[k] = from->samples[k];
+  }
+  to->checksum = from->checksum;
+}
+
+void {{ name }}_calibration_init({{ name }}_calibration *c) {
+  copy_parameters(&{{ name }}_default_parameters, &c->working);
+  copy_parameters(&{{ name }}_default_parameters, &c->pages[0]);
+  copy_parameters(&{{ name }}_default_parameters, &c->pages[1]);
+  c->ready = 0;
+  c->used = 0;
+  c->reason = {{ NAME }}_PARAMETERS_TAKEN;
+  c->entry = -1;
+  c->commits = 0;
+}
+
+int32_t {{ name }}_calibration_commit({{ name }}_calibration *c, const {{ name }}_parameters *p) {
+  if (c->ready != 0) {
+    c->reason = {{ NAME }}_PARAMETERS_BUSY;
+    c->entry = -1;
+  } else {
+    const {{ name }}_parameters *const from = (p == NULL) ? &{{ name }}_default_parameters : p;
+    {{ name }}_parameters *const page = &c->pages[1 - c->used];
+    copy_parameters(from, page);
+    page->checksum = {{ name }}_checksum(page);
+    c->reason = {{ name }}_refuses_parameters(page, &c->entry);
+    if (c->reason == {{ NAME }}_PARAMETERS_TAKEN) {
+      c->ready = 1;
+    }
+  }
+  return c->reason;
+}
+
+void {{ name }}_calibration_take({{ name }}_calibration *c, {{ name }}_state *s) {
+  if (c->ready == 1) {
+    c->used = 1 - c->used;
+    s->parameters = &c->pages[c->used];
+    c->commits++;
+    c->ready = 0;
+  }
 }

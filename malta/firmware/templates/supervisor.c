@@ -2,6 +2,9 @@
 #include "{{ name }}_supervisor.h"
 
 #include <stdbool.h>
+{% if tunable %}
+#include <stddef.h>
+{% endif %}
 {% include "exact.c" %}
 
 {% include "arithmetic.c" %}
@@ -17,6 +20,9 @@
 #define EVENT_LAND 4
 #define EVENT_FAULT 5
 #define EVENT_ACKNOWLEDGE 6
+{% if wiring %}
+#define EVENT_WIRE 7
+{% endif %}
 
 const {{ name }}_monitor {{ name }}_monitors[{{ NAME }}_MONITOR_ROWS] = {
 {% for row in rows %}
@@ -32,18 +38,30 @@ typedef struct {
 
 static const {{ name }}_real near_touch[OUTPUTS] = { {{ touch }} };
 static const {{ name }}_real range[OUTPUTS] = { {{ range }} };
+static const {{ name }}_real sigma[OUTPUTS] = { {{ sigma }} }; /* of a reading */
 {% if not tunable %}
-static const {{ name }}_real fastest[OUTPUTS] = { {{ limits.speed }} };      /* of references */
+static const {{ name }}_real farthest[OUTPUTS] = { {{ limits.position }} };   /* of references */
+static const {{ name }}_real fastest[OUTPUTS] = { {{ limits.speed }} };
 static const {{ name }}_real steepest[OUTPUTS] = { {{ limits.acceleration }} };
 {% endif %}
+{% set farthest = "sup->parameters->position" if tunable else "farthest" %}
 {% set fastest = "sup->parameters->speed" if tunable else "fastest" %}
 {% set steepest = "sup->parameters->acceleration" if tunable else "steepest" %}
 {% set row_samples = "sup->parameters->samples[r]" if tunable else "row->samples" %}
 
 static {{ name }}_real size_of({{ name }}_real value) { return (value < {{ zero }}) ? -value : value; }
 
+static {{ name }}_real between({{ name }}_real low, {{ name }}_real value, {{ name }}_real high) {
+  const {{ name }}_real bounded = (value > low) ? value : low;
+  return (bounded < high) ? bounded : high;
+}
+
 static int32_t is_flying(int32_t state) {
   return ((state >= {{ NAME }}_LIFT) && (state <= {{ NAME }}_LANDING)) ? 1 : 0;
+}
+
+static bool is_lifting(const {{ name }}_supervisor *sup) {
+  return (sup->state == {{ NAME }}_LIFT) || (sup->state == {{ NAME }}_LANDING);
 }
 
 /* A count and one, up to a number of samples that stands for ever: a machine may be off for days. */
@@ -60,6 +78,15 @@ static int32_t is_within({{ name }}_real value, {{ name }}_real most) {
   return ((value <= most) && (value >= -most)) ? 1 : 0;
 }
 
+/* A mean with one more value in it; what is no number is left out, or the mean would be none for ever. */
+static {{ name }}_real mean_with({{ name }}_real mean, {{ name }}_real share, {{ name }}_real value) {
+  {{ name }}_real next = mean;
+  if (is_within(value, {{ most }}) == 1) {
+    next = mean + (share * (value - mean));
+  }
+  return next;
+}
+
 /* Steps that were missed before a sample. */
 static int32_t missed_of(const {{ name }}_request *request) {
   const int32_t some = (request->missed > 0) ? request->missed : 0;
@@ -70,15 +97,31 @@ static void forget_sensors({{ name }}_supervisor *sup) {
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
     sup->unbelieved[k] = 0;
+    sup->agreed[k] = 0;
+    sup->lapses[k] = 0;
     sup->repeated[k] = 0;
     sup->since[k] = {{ zero }};
     sup->limited[k] = {{ zero }};
     sup->noise[k] = {{ zero }};
+    sup->error[k] = {{ zero }};
+    sup->usual[k] = {{ zero }};
+    sup->away[k] = {{ zero }};
+    sup->shift[k] = {{ zero }};
   }
   for (k = 0; k < {{ rows | length * outputs }}; k++) {
     sup->count[k] = 0;
   }
   sup->unchanged = 0;
+  sup->unrest = {{ zero }};
+{% if currents %}
+  for (k = 0; k < {{ axes }}; k++) {
+    sup->off_mean[k] = {{ zero }};
+    sup->beyond_mean[k] = {{ zero }};
+  }
+{% for _ in stars %}
+  sup->still[{{ loop.index0 }}] = 0;
+{% endfor %}
+{% endif %}
 }
 
 void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
@@ -95,11 +138,18 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   sup->acknowledged = 1;
   sup->overruns = 0;
   sup->followed = 0;
+  sup->seeing = 0;
+  sup->leapt = -1;
+  sup->leap = {{ zero }};
+  sup->steered = 0;
   sup->late = {{ zero }};
   sup->samples = 0;
   sup->steady = 0;
 {% if tunable %}
   sup->parameters = &{{ name }}_default_parameters;
+  sup->calibration = NULL;
+  sup->refused = 0;
+  sup->refused_entry = -1;
 {% endif %}
   for (k = 0; k < {{ NAME }}_MONITOR_ROWS; k++) {
     sup->acted[k] = 0;
@@ -110,6 +160,7 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
     sup->place[k] = {{ zero }};
     sup->asked[k] = {{ zero }};
     sup->asked_rate[k] = {{ zero }};
+    sup->paced[k] = 0;
     sup->d0[k] = {{ zero }};
     sup->d1[k] = {{ zero }};
     sup->d2[k] = {{ zero }};
@@ -126,17 +177,26 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   for (k = 0; k < {{ currents }}; k++) {
     sup->i_before[k] = {{ zero }};
   }
-  for (k = 0; k < {{ axes }}; k++) {
-    sup->off_mean[k] = {{ zero }};
-    sup->beyond_mean[k] = {{ zero }};
-  }
-{% for _ in stars %}
-  sup->still[{{ loop.index0 }}] = 0;
-{% endfor %}
   sup->commanded = 0;
 {% endif %}
 {% if stars %}
+  for (k = 0; k < {{ currents }}; k++) {
+    sup->raw_current[k] = {{ zero }};
+    sup->same_current[k] = 0;
+  }
   sup->inferred = 0;
+{% endif %}
+{% if wiring %}
+  sup->wired = 0;
+{% for member in wiring_members %}
+{% if member.size %}
+  for (k = 0; k < {{ member.size }}; k++) {
+    sup->{{ member.name }}[k] = {{ zero if member.kind == "real" else 0 }};
+  }
+{% else %}
+  sup->{{ member.name }} = {{ zero if member.kind == "real" else 0 }};
+{% endif %}
+{% endfor %}
 {% endif %}
   forget_sensors(sup);
 }
@@ -153,11 +213,9 @@ void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }
   }
 }
 
-{% if not tracks_errors %}
-{% if root %}
 {% include "root.c" %}
 
-{% endif %}
+{% if not tracks_errors %}
 {{ expectation }}
 {% endif %}
 {% if fallback %}
@@ -165,6 +223,21 @@ void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }
 {% endif %}
 {% if currents %}
 {{ deviation }}
+{% endif %}
+{% if wiring %}
+{% include "wiring.c" %}
+{% endif %}
+{% if rates %}
+/* Over steps that were missed the machine has gone on: a filter that knows nothing of it would throw a stroke. */
+static void coast({{ name }}_state *s, const {{ name }}_request *request) {
+  const {{ name }}_real t = ({{ name }}_real)missed_of(request) * {{ NAME }}_SAMPLE_TIME;
+  int32_t k;
+  for (k = 0; k < {{ rates }}; k++) {
+    const {{ name }}_real way = t * s->xi_pred[{{ rates }} + k];
+    s->xi_pred[k] = s->xi_pred[k] + way;
+  }
+}
+
 {% endif %}
 /* What the filter expects of the readings; of a machine that does not fly, the readings themselves. */
 static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in,
@@ -181,9 +254,52 @@ static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, 
   } else {
     int32_t k;
     for (k = 0; k < OUTPUTS; k++) {
-      expected[k] = in->y[k];
+      expected[k] = (is_within(in->y[k], range[k]) == 1) ? in->y[k] : {{ zero }};
     }
   }
+}
+
+/* What a reading will be off its reference soon, if the error grows on as it does: one that is lost doubles meanwhile. */
+static {{ name }}_real error_ahead({{ name }}_supervisor *sup, {{ name }}_real error, int32_t k) {
+  const {{ name }}_real counts = (is_flying(sup->state) == 1) ? error : {{ zero }};
+  sup->error[k] = mean_with(sup->error[k], {{ error_share }}, counts);
+  return counts + ({{ ahead }} * (counts - sup->error[k]));
+}
+
+{% if currents %}
+/* How much more of an error is carried: a current off its command pushes the machine, and CURRENT_ERROR lands it.
+   A lift and a landing have such room anyway. */
+static {{ name }}_real carried(const {{ name }}_supervisor *sup) {
+  {{ name }}_real times = {{ one }};
+  int32_t k;
+  for (k = 0; k < {{ axes }}; k++) {
+    times = (!is_lifting(sup) && (size_of(sup->off_mean[k]) > {{ uncommanded }})) ? {{ freer }} : times;
+  }
+  return times;
+}
+
+{% endif %}
+/* How far a reading may be: on the side where it rests a machine that lifts off or lands is at its bearing. */
+static {{ name }}_real end_of(const {{ name }}_supervisor *sup, {{ name }}_real y, int32_t k) {
+  const {{ name }}_real rests = size_of(sup->rest[k]) + ({{ beside }} * near_touch[k]);
+  const bool same = is_lifting(sup) && ((y * sup->rest[k]) > {{ zero }});
+  return (same && (rests > near_touch[k])) ? rests : near_touch[k];
+}
+
+/* Whether a reading is as near to a place as that of a machine that has settled. */
+static int32_t is_near({{ name }}_real y, {{ name }}_real place, int32_t k) {
+  static const {{ name }}_real settled[OUTPUTS] = { {{ settled }} };
+  return is_within(y - place, settled[k]);
+}
+
+/* Whether a machine that lifts off or lands is off its bearing, by any of its sensors: on it, nothing moves. */
+static bool has_left(const {{ name }}_supervisor *sup) {
+  bool left = false;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    left = left || ({{ "(k != %d) && "|format(stroke_output) if stroke_output >= 0 }}(is_near(sup->last[k], sup->rest[k], k) == 0));
+  }
+  return left;
 }
 
 /* A sensor that repeats a reading, as a share of what noise allows; or of the way that its reference has gone since. */
@@ -194,11 +310,49 @@ static {{ name }}_real stuck_level({{ name }}_supervisor *sup, {{ name }}_real r
   if (sup->repeated[k] == 0) {
     sup->since[k] = reference;
   }
-  if (((sup->state == {{ NAME }}_LIFT) || (sup->state == {{ NAME }}_LANDING)) && (sup->repeated[k] >= {{ repeats }})) {
+  if (is_lifting(sup) && (sup->repeated[k] >= {{ repeats }}) && has_left(sup)) {
     const {{ name }}_real gone = size_of(reference - sup->since[k]) / unmoved[k];
     level = (gone > level) ? gone : level;
   }
   return level;
+}
+
+/* Whether a sensor that is ignored reads what the filter expects. A filter alone knows less from sample to sample, so
+   what it may differ by grows: no further than a share of the clearance, and in flight not for long; in a landing for a
+   moment alone, as a law that follows a wrong reading would not meet its bearing slowly. */
+static int32_t agrees(const {{ name }}_supervisor *sup, {{ name }}_real away, {{ name }}_real moved, {{ name }}_real deviation, int32_t k) {
+  static const {{ name }}_real drift[OUTPUTS] = { {{ drift }} }; /* of what the filter expects alone, per sample^2 */
+  static const {{ name }}_real nearest[OUTPUTS] = { {{ nearest }} };
+  const {{ name }}_real age = ({{ name }}_real)sup->unbelieved[k];
+  const {{ name }}_real grown = ({{ believed }} * deviation) + ((age * age) * drift[k]);
+  const {{ name }}_real strange = away - sup->usual[k]; /* a filter that a bearing pushes is off while all is well */
+  const bool lands = sup->state == {{ NAME }}_LANDING;
+  const bool soon = (is_flying(sup->state) == 0) || (sup->unbelieved[k] <= (lands ? {{ bridged }} : {{ unbelieved }}));
+  const bool calm = (sup->agreed[k] == 0) || (moved <= ({{ jump_deviations }} * deviation)); /* it may leap back once */
+  return (soon && calm && (strange <= ((grown < nearest[k]) ? grown : nearest[k]))) ? 1 : 0;
+}
+
+/* Good readings until an ignored sensor is believed again: four times as many for each time that it was wrong lately, and
+   one of a sensor that had none for a moment. */
+static int32_t needed_of(const {{ name }}_supervisor *sup, int32_t k) {
+  const bool paused = (sup->lapses[k] == 0) && (sup->unbelieved[k] <= {{ bridged }});
+  int32_t needed = {{ agreement }};
+  int32_t j;
+  if (paused) {
+    needed = 1;
+  }
+  for (j = 1; j < {{ most_lapses }}; j++) {
+    if (j < sup->lapses[k]) {
+      needed = 4 * needed;
+    }
+  }
+  return needed;
+}
+
+/* By how much a sensor is noisier than it is said to be, 1 at least. */
+static {{ name }}_real excess_noise(const {{ name }}_supervisor *sup, int32_t k) {
+  const {{ name }}_real times = sup->noise[k] / ({{ mean_jump }} * sigma[k]);
+  return (times > {{ one }}) ? times : {{ one }};
 }
 
 /* Levels of the monitors of each position sensor. */
@@ -206,44 +360,136 @@ static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *
                            {{ name }}_real expected, {{ name }}_real reference,
                            {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
   static const {{ name }}_real jump[OUTPUTS] = { {{ jump }} }; /* from sample to sample */
-  static const {{ name }}_real sigma[OUTPUTS] = { {{ sigma }} }; /* of a reading */
-  static const {{ name }}_real drift[OUTPUTS] = { {{ drift }} }; /* of what the filter expects alone, per sample^2 */
+  static const {{ name }}_real astray[OUTPUTS] = { {{ astray }} }; /* off a reference */
   const {{ name }}_real y = in->y[k];
   const int32_t is_number = is_within(y, {{ most }});
   if ((is_number == 1) && (in->y_valid[k] > {{ half }})) { /* a NaN is no yes */
     const {{ name }}_real moved = size_of(y - sup->last[k]);
-    const {{ name }}_real age = ({{ name }}_real)sup->unbelieved[k];
     const {{ name }}_real away = size_of(y - expected);
-    const {{ name }}_real grown = (age * age) * drift[k];
-    const {{ name }}_real counted = (moved < range[k]) ? moved : range[k];
-    {{ name }}_real near_expected;
+    const {{ name }}_real counted = (moved < jump[k]) ? moved : jump[k]; /* a jump is no noise */
     {{ name }}_real more;
-    sup->noise[k] = sup->noise[k] + ({{ memory }} * (counted - sup->noise[k]));
-    more = sup->noise[k] / ({{ mean_jump }} * sigma[k]); /* readings may be noisier than they are said to be */
-    more = (more > {{ one }}) ? more : {{ one }};
-    near_expected = ({{ believed }} * (sigma[k] * more)) + grown;
+    if (sup->unbelieved[k] == 0) {
+      sup->noise[k] = mean_with(sup->noise[k], {{ memory }}, counted);
+    }
+    more = excess_noise(sup, k);
     sup->repeated[k] = (y == sup->last[k]) ? one_more(sup->repeated[k]) : 0;
     level[{{ NAME }}_MONITOR_RANGE][k] = size_of(y) / range[k];
     level[{{ NAME }}_MONITOR_STUCK][k] = stuck_level(sup, reference, k);
     if (sup->unbelieved[k] == 0) {
       const int32_t steps = missed + 1;
-      level[{{ NAME }}_MONITOR_TOUCH][k] = size_of(y) / near_touch[k];
+      sup->usual[k] = mean_with(sup->usual[k], {{ error_share }}, (away < jump[k]) ? away : jump[k]);
+      level[{{ NAME }}_MONITOR_TOUCH][k] = size_of(y) / end_of(sup, y, k);
+      level[{{ NAME }}_MONITOR_FOLLOWING][k] = size_of(error_ahead(sup, y - reference, k)) / {{ "(carried(sup) * astray[k])" if currents else "astray[k]" }};
       const {{ name }}_real wider = {{ jump_deviations }} * (sigma[k] * (more - {{ one }}));
       level[{{ NAME }}_MONITOR_RATE][k] = moved / ((jump[k] + wider) * ({{ name }}_real)steps);
       level[{{ NAME }}_MONITOR_INNOVATION][k] = away / (sigma[k] * more);
-    } else if (away > near_expected) {
-      level[{{ NAME }}_MONITOR_UNBELIEVED][k] = {{ one }};
+{% if stroke_output >= 0 %}
+      /* a filter without a sensor, or after a missed step, expects less well */
+      const bool whole = (sup->seeing == OUTPUTS) && (sup->late < {{ recent_miss }});
+      level[{{ NAME }}_MONITOR_STROKE][k] = (whole && (k == {{ stroke_output }})) ? (away / (sigma[k] * more)) : {{ zero }};
+{% endif %}
     } else {
-      /* believed again, unless a monitor objects */
+      sup->error[k] = y - reference; /* what it is off when it is believed again is no growth */
+      sup->agreed[k] = (agrees(sup, away, moved, sigma[k] * more, k) == 1) ? one_more(sup->agreed[k]) : 0;
+      if (sup->agreed[k] < needed_of(sup, k)) {
+        level[{{ NAME }}_MONITOR_UNBELIEVED][k] = {{ one }};
+      }
     }
     sup->last[k] = y;
   } else {
     level[{{ NAME }}_MONITOR_NAN][k] = {{ one }};
+    sup->agreed[k] = 0;
     sup->repeated[k] = 0;
     sup->since[k] = reference;
   }
 }
 
+{% if leaps %}
+/* Whether a sensor that leapt is back within some samples, as one that is noisy is and one that drifts is not. */
+static bool is_back(const {{ name }}_supervisor *sup, {{ name }}_real away, int32_t k) {
+  const {{ name }}_real most = {{ three }} * size_of(sup->leap);
+  const bool near = (is_within(away, most) == 1) && ((away * sup->leap) < ({{ half }} * (sup->leap * sup->leap)));
+  return (k == sup->leapt) && (sup->unbelieved[k] <= {{ held }}) && near;
+}
+
+/* The leap of a sensor that is back was noise. */
+static void learn_noise({{ name }}_supervisor *sup, {{ name }}_real away, int32_t k) {
+  const {{ name }}_real noise = {{ quarter }} * size_of(sup->leap);
+  sup->noise[k] = (noise > sup->noise[k]) ? noise : sup->noise[k];
+  sup->away[k] = between(-range[k], away, range[k]);
+}
+
+/* The most of sensors that are believed: what the filter expects of the others follows the noisiest. Along a stroke
+   readings change by themselves. */
+static {{ name }}_real most_excess_noise(const {{ name }}_supervisor *sup) {
+  {{ name }}_real most = {{ one }};
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    const {{ name }}_real more = excess_noise(sup, k);
+    most = ({{ "(k != %d) && "|format(stroke_output) if stroke_output >= 0 }}(sup->unbelieved[k] == 0) && (more > most)) ? more : most;
+  }
+  return most;
+}
+
+/* A reading that leaps from sample to sample off what the filter expects, by more than noise and the machine can do, is
+   wrong, unless it is back soon: the law would take it for a speed, and throw the machine. A filter that follows a reading that is wrong by less is
+   off those that are right within some samples: nothing tells which, and a fall is softer than what the law would do. So
+   it is for a filter without a sensor that is off the others. */
+static void look_for_leaps({{ name }}_supervisor *sup, const {{ name }}_inputs *in, int32_t missed,
+                           const {{ name }}_real expected[OUTPUTS], {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+  static const {{ name }}_real leap[OUTPUTS] = { {{ leap }} };
+  const {{ name }}_real times = (sup->state == {{ NAME }}_LIFT) ? {{ freer }} : {{ one }}; /* a bearing pushes */
+  const {{ name }}_real rougher = most_excess_noise(sup);
+  const bool flies = is_flying(sup->state) == 1;
+  const bool whole = sup->seeing == OUTPUTS;
+  const bool counts = (missed == 0) && (sup->late < {{ recent_miss }}); /* after a missed step a filter expects less well */
+  {{ name }}_real most_leapt = {{ one }};
+  {{ name }}_real first = {{ zero }};
+  {{ name }}_real second = {{ zero }};
+  int32_t wrong = -1;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if ((k == sup->leapt) && (sup->unbelieved[k] == 0)) {
+      sup->leapt = -1; /* what comes next is another fault */
+    }
+    if ((sup->unbelieved[k] == 0) && (level[{{ NAME }}_MONITOR_NAN][k] < {{ half }})) {
+      const {{ name }}_real most = rougher * leap[k];
+      const {{ name }}_real away = in->y[k] - expected[k];
+      const {{ name }}_real off = size_of(away - sup->shift[k]) / most;
+      const {{ name }}_real change = size_of(away - sup->away[k]) / most;
+      const {{ name }}_real leapt = (change < off) ? change : off;
+      const bool again = ((away - sup->shift[k]) * (sup->away[k] - sup->shift[k])) > {{ zero }}; /* noise is not */
+      const {{ name }}_real calm = (again && (off > ({{ apart_from_others }} * sup->unrest))) ? off : {{ zero }};
+      const {{ name }}_real lost = whole ? (calm / ({{ lost_with_all }} * times)) : (size_of(away) / ({{ lost_alone }} * most));
+      if (leapt > most_leapt) {
+        most_leapt = leapt;
+        wrong = k;
+      }
+      second = between(second, change, first);
+      first = (change > first) ? change : first;
+      if (flies && counts && (lost > level[{{ NAME }}_MONITOR_ASTRAY][k])) {
+        level[{{ NAME }}_MONITOR_ASTRAY][k] = lost;
+      }
+      sup->away[k] = between(-range[k], away, range[k]);
+      sup->shift[k] = mean_with(sup->shift[k], {{ error_share }}, sup->away[k]);
+    } else if ((level[{{ NAME }}_MONITOR_NAN][k] < {{ half }}) && is_back(sup, in->y[k] - expected[k], k)) {
+      learn_noise(sup, in->y[k] - expected[k], k);
+      level[{{ NAME }}_MONITOR_UNBELIEVED][k] = {{ zero }};
+    } else {
+      /* it is ignored on */
+    }
+  }
+  /* where all are noisy none is wrong */
+  if (flies && counts && whole && (wrong >= 0) && (most_leapt > ({{ two }} * second)) &&
+      (most_leapt > ({{ apart_from_others }} * sup->unrest))) {
+    sup->leapt = (level[{{ NAME }}_MONITOR_RATE][wrong] > {{ one }}) ? -1 : wrong;
+    sup->leap = sup->away[wrong];
+    level[{{ NAME }}_MONITOR_RATE][wrong] = most_leapt;
+  }
+  sup->unrest = mean_with(sup->unrest, {{ error_share }}, second);
+}
+
+{% endif %}
 /* Levels of the monitors that look at all position sensors together. */
 static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
   int32_t repeated = 1;
@@ -257,6 +503,7 @@ static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{
       believed++;
     }
   }
+  sup->seeing = believed;
   sup->unchanged = (repeated == 1) ? one_more(sup->unchanged) : 0;
   for (k = 0; k < OUTPUTS; k++) {
     level[{{ NAME }}_MONITOR_STALE][k] = ({{ name }}_real)sup->unchanged;
@@ -273,7 +520,7 @@ static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_r
 {% if tunable %}
   const {{ name }}_real *const most = sup->parameters->position;
 {% else %}
-  static const {{ name }}_real most[OUTPUTS] = { {{ limits.position }} };
+  const {{ name }}_real *const most = farthest;
 {% endif %}
   const {{ name }}_reference *r = &request->reference;
   const int32_t steps = missed_of(request) + 1;
@@ -299,10 +546,20 @@ static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_r
   return accepted;
 }
 
-/* The last reference that was requested in numbers of possible size: what the next one steps from. */
-static void remember({{ name }}_supervisor *sup, const {{ name }}_reference *r) {
+/* The last reference that was requested in numbers of possible size: what the next one steps from. Its rate is used where
+   it is that of its places, else the place alone. */
+static void remember({{ name }}_supervisor *sup, const {{ name }}_request *request) {
+  const {{ name }}_reference *r = &request->reference;
+  const int32_t steps = missed_of(request) + 1;
+  const {{ name }}_real h = ({{ name }}_real)steps * {{ NAME }}_SAMPLE_TIME;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
+    const {{ name }}_real way = ({{ half }} * h) * (r->dp[k] + sup->asked_rate[k]);
+    const {{ name }}_real most = ({{ rounding }} * range[k]) + ({{ steepest }}[k] * (h * h));
+    sup->paced[k] = 0;
+    if ((sup->followed == 1) && (is_within((r->p[k] - sup->asked[k]) - way, most) == 1)) {
+      sup->paced[k] = 1;
+    }
     if ((is_within(r->p[k], range[k]) == 1) && (is_within(r->dp[k], {{ most_rate }}) == 1)) {
       sup->asked[k] = r->p[k];
       sup->asked_rate[k] = r->dp[k];
@@ -310,30 +567,55 @@ static void remember({{ name }}_supervisor *sup, const {{ name }}_reference *r) 
     }
   }
 }
+{% if currents %}
+
+/* 1 where a current has a reading that is a number of possible size. */
+static int32_t has_current(const {{ name }}_inputs *in, int32_t k) {
+  return ((is_within(in->i[k], {{ most }}) == 1) && (in->i_valid[k] > {{ half }})) ? 1 : 0;
+}
+{% endif %}
 {% if stars %}
 
 static const int32_t stars[{{ stars | length }}][{{ stars[0] | length }}] = { {% for star in stars %}{ {{ star | join(", ") }} }{{ ", " if not loop.last }}{% endfor %} };
 
-/* A current without a reading is known by the others of its star, which add up to zero with it. */
+/* Counts readings that repeat: {{ longest }} from when one is known to be frozen, as its star is uneven, until it changes. */
+static int32_t is_frozen({{ name }}_supervisor *sup, int32_t k, {{ name }}_real i, {{ name }}_real sum) {
+  const bool same = (is_flying(sup->state) == 1) && (i == sup->raw_current[k]);
+  const int32_t repeats = same ? one_more(sup->same_current[k]) : 0;
+  const bool uneven = (repeats >= {{ frozen_samples }}) && (size_of(sum) > {{ uneven }});
+  sup->raw_current[k] = (is_within(i, {{ most }}) == 1) ? i : {{ zero }};
+  sup->same_current[k] = uneven ? {{ longest }} : repeats;
+  return (sup->same_current[k] == {{ longest }}) ? 1 : 0;
+}
+
+/* A current whose reading is lost or frozen is known by the others of its star, which add up to zero with it. */
 static void infer_currents({{ name }}_supervisor *sup, {{ name }}_inputs *seen) {
   int32_t s;
   sup->inferred = 0;
   for (s = 0; s < {{ stars | length }}; s++) {
     {{ name }}_real sum = {{ zero }};
+    {{ name }}_real moved = {{ zero }};
     int32_t lost = 0;
     int32_t which = 0;
     int32_t j;
     for (j = 0; j < {{ stars[0] | length }}; j++) {
       const int32_t k = stars[s][j];
-      if ((is_within(seen->i[k], {{ most }}) == 1) && (seen->i_valid[k] > {{ half }})) {
+      if (has_current(seen, k) == 1) {
         sum = sum + seen->i[k];
+      }
+    }
+    for (j = 0; j < {{ stars[0] | length }}; j++) {
+      const int32_t k = stars[s][j];
+      const int32_t frozen = is_frozen(sup, k, seen->i[k], sum);
+      if ((has_current(seen, k) == 1) && (frozen == 0)) {
+        moved = moved + seen->i[k];
       } else {
         lost++;
         which = k;
       }
     }
     if (lost == 1) {
-      seen->i[which] = -sum;
+      seen->i[which] = -moved;
       seen->i_valid[which] = {{ one }};
       sup->inferred++;
     }
@@ -348,7 +630,7 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
                              {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
   int32_t k;
   for (k = 0; k < {{ currents }}; k++) {
-    if ((is_within(in->i[k], {{ most }}) == 0) || !(in->i_valid[k] > {{ half }})) {
+    if (has_current(in, k) == 0) {
       level[{{ NAME }}_MONITOR_CURRENT_LOST][0] = {{ one }};
     } else if (size_of(in->i[k]) > level[{{ NAME }}_MONITOR_CURRENT][0]) {
       level[{{ NAME }}_MONITOR_CURRENT][0] = size_of(in->i[k]);
@@ -394,8 +676,8 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
       const bool told = level[{{ NAME }}_MONITOR_LINK][0] <= {{ sagging }};
       const {{ name }}_real now = told ? off[k] : {{ zero }};
       const {{ name }}_real more = told ? beyond[k] : {{ zero }};
-      sup->off_mean[k] = sup->off_mean[k] + ({{ mean_share }} * (now - sup->off_mean[k]));
-      sup->beyond_mean[k] = sup->beyond_mean[k] + ({{ mean_share }} * (more - sup->beyond_mean[k]));
+      sup->off_mean[k] = mean_with(sup->off_mean[k], {{ mean_share }}, now);
+      sup->beyond_mean[k] = mean_with(sup->beyond_mean[k], {{ mean_share }}, more);
       if (size_of(sup->off_mean[k]) > level[{{ NAME }}_MONITOR_CURRENT_ERROR][0]) {
         level[{{ NAME }}_MONITOR_CURRENT_ERROR][0] = size_of(sup->off_mean[k]);
       }
@@ -444,15 +726,21 @@ static void look({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{
     }
   }
   look_at_sensors(sup, level);
+{% if leaps %}
+  look_for_leaps(sup, in, missed, expected, level);
+{% endif %}
   level[{{ NAME }}_MONITOR_MISSED][0] = ({{ name }}_real)missed;
   sup->overruns = (missed > 0) ? one_more(sup->overruns) : sup->overruns;
-  sup->late = sup->late + ({{ memory }} * (((missed > 0) ? {{ one }} : {{ zero }}) - sup->late));
+  sup->late = mean_with(sup->late, {{ memory }}, (missed > 0) ? {{ one }} : {{ zero }});
   level[{{ NAME }}_MONITOR_OVERRUN][0] = sup->late;
   level[{{ NAME }}_MONITOR_STOP][0] = (request->stop != 0) ? {{ one }} : {{ zero }};
   level[{{ NAME }}_MONITOR_STO][0] = (request->sto != 0) ? {{ one }} : {{ zero }};
   level[{{ NAME }}_MONITOR_REFERENCE][0] = (is_reference(sup, request) == 1) ? {{ zero }} : {{ one }};
   level[{{ NAME }}_MONITOR_UNSETTLED][0] = ({{ name }}_real)sup->samples;
   level[{{ NAME }}_MONITOR_UNREADY][0] = ({{ name }}_real)sup->samples;
+{% if wiring %}
+  level[{{ NAME }}_MONITOR_WIRING][0] = (sup->wired == -1) ? {{ one }} : {{ zero }};
+{% endif %}
 {% if currents %}
   look_at_currents(sup, in, expected, level);
 {% endif %}
@@ -505,6 +793,20 @@ static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monito
     }
   }
   for (k = 0; k < OUTPUTS; k++) {
+    if (refused[k] && (sup->unbelieved[k] == 0)) {
+      /* no reading is no wrong one, nor is one that repeats */
+      const bool lied = (level[{{ NAME }}_MONITOR_RANGE][k] > {{ one }}) || ((level[{{ NAME }}_MONITOR_RATE][k] > {{ one }}) && (k != sup->leapt));
+      sup->lapses[k] = (lied && (sup->lapses[k] < {{ most_lapses }})) ? (sup->lapses[k] + 1) : sup->lapses[k];
+      sup->agreed[k] = 0;
+    } else if (!refused[k]) {
+      sup->agreed[k] = one_more(sup->agreed[k]);
+      if (sup->agreed[k] > {{ lapse_samples }}) {
+        sup->lapses[k] = (sup->lapses[k] > 0) ? (sup->lapses[k] - 1) : 0;
+        sup->agreed[k] = 0;
+      }
+    } else {
+      /* it is ignored on */
+    }
     sup->unbelieved[k] = refused[k] ? one_more(sup->unbelieved[k]) : 0;
     if (refused[k] && (sup->state == {{ NAME }}_SENSORS)) {
       calm = 0;
@@ -532,20 +834,19 @@ static void average_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
 }
 
 {% endif %}
-/* Average the readings of a machine at rest: the place where it lands again. */
+/* Average the readings of a machine at rest: the place where it lands again. One that slides begins anew. */
 static void average_rest({{ name }}_supervisor *sup) {
   const int32_t number = (sup->steady > 0) ? sup->steady : 1;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
+    if ((number > 1) && (is_near(sup->last[k], sup->rest[k], k) == 0)) {
+      sup->steady = 0;
+    }
+  }
+  for (k = 0; k < OUTPUTS; k++) {
     const {{ name }}_real more = (sup->last[k] - sup->rest[k]) / ({{ name }}_real)number;
     sup->rest[k] = sup->rest[k] + more;
   }
-}
-
-/* Whether a reading is as near to a place as that of a machine that has settled. */
-static int32_t is_near({{ name }}_real y, {{ name }}_real place, int32_t k) {
-  static const {{ name }}_real settled[OUTPUTS] = { {{ settled }} };
-  return is_within(y - place, settled[k]);
 }
 
 /* Samples in a row at which a machine that lands without one of its sensors is where it rested, by the others. */
@@ -563,7 +864,11 @@ static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in
     }
 {% else %}
     } else if (is_near(in->y[k], sup->rest[k], k) == 1) {
+{% if loose %}
+      there = (near_touch[k] < {{ endless }}) ? 1 : there; /* where nothing is met, a reading is everywhere near */
+{% else %}
       there{{ " = (k != %d) ? 1 : there"|format(stroke_output) if stroke_output >= 0 else " = 1" }};
+{% endif %}
     } else {
       away{{ " = (k != %d) ? 1 : away"|format(stroke_output) if stroke_output >= 0 else " = 1" }};
     }
@@ -594,7 +899,7 @@ static void count_settled({{ name }}_supervisor *sup, const {{ name }}_state *s,
 /* Whether the reference has reached its place: at rest. */
 static bool is_at_rest(const {{ name }}_supervisor *sup) {
   const {{ name }}_real t = ({{ name }}_real)sup->samples * {{ NAME }}_SAMPLE_TIME;
-  bool rests = true;
+  bool rests = sup->steered == 0;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
     rests = rests && (t >= sup->lasts[k]);
@@ -612,6 +917,11 @@ static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *
   case {{ NAME }}_SENSORS:
     done = sup->steady >= sup->times.check;
     break;
+{% if wiring %}
+  case {{ NAME }}_WIRING:
+    done = sup->wired == 1;
+    break;
+{% endif %}
   case {{ NAME }}_LIFT:
     done = sup->samples >= sup->times.lift;
     break;
@@ -642,6 +952,22 @@ static bool is_startable(const {{ name }}_supervisor *sup, const {{ name }}_requ
 {% endif %}
 }
 
+{% if tunable %}
+/* Why a start is refused. */
+static void refuse_start({{ name }}_supervisor *sup, const {{ name }}_request *request) {
+  if ((request->start != 0) && (sup->started == 0) && (sup->state == {{ NAME }}_OFF)) {
+    sup->refused_entry = -1;
+    if (sup->fit != 1) {
+      sup->refused = {{ NAME }}_START_ARITHMETIC;
+    } else if ((request->stop != 0) || (request->sto != 0)) {
+      sup->refused = {{ NAME }}_START_STOPPED;
+    } else {
+      sup->refused = {{ name }}_refuses_parameters(sup->parameters, &sup->refused_entry);
+    }
+  }
+}
+
+{% endif %}
 /* Whether nothing forbids torque. */
 static bool is_free(const {{ name }}_request *request) { return (request->stop == 0) && (request->sto == 0); }
 
@@ -656,6 +982,11 @@ static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_reque
     event = EVENT_HOLD;
   } else if (is_done(sup, request)) {
     event = EVENT_DONE;
+{% if wiring %}
+    if ((sup->state == {{ NAME }}_SENSORS) && (sup->wired != 1)) {
+      event = EVENT_WIRE;
+    }
+{% endif %}
   } else if (is_startable(sup, request) && is_free(request)) {
     event = EVENT_START;
   } else if ((request->acknowledge != 0) && (sup->acknowledged == 0) && is_free(request)) {
@@ -710,8 +1041,10 @@ static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *
   goal[2] = {{ zero }};
   if (sup->state == {{ NAME }}_OPERATE) {
     goal[0] = request->reference.p[k];
-    goal[1] = request->reference.dp[k];
-    goal[2] = request->reference.ddp[k];
+    if (sup->paced[k] == 1) {
+      goal[1] = request->reference.dp[k];
+      goal[2] = request->reference.ddp[k];
+    }
   }
 }
 
@@ -801,7 +1134,7 @@ static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const 
     }
   }
   if (to == from) {
-    const int32_t passed = 1 + missed_of(request);
+    const int32_t passed = (is_flying(from) == 1) ? (1 + missed_of(request)) : 1; /* readings are averaged, not time */
     sup->samples = (sup->samples < {{ longest }}) ? (sup->samples + passed) : sup->samples;
   } else {
     sup->state = to;
@@ -820,6 +1153,11 @@ static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const 
       }
 {% endif %}
     }
+{% if wiring %}
+    if (to == {{ NAME }}_WIRING) {
+      begin_wiring(sup);
+    }
+{% endif %}
     if (to == {{ NAME }}_LIFT) {
       int32_t k;
       for (k = 0; k < OUTPUTS; k++) {
@@ -872,6 +1210,64 @@ static void fade_acceleration({{ name }}_real t, {{ name }}_real d2, {{ name }}_
   }
 }
 
+/* The speed of the next sample from which an output stops within a way: at the speed v now, braking with a. */
+static {{ name }}_real speed_for({{ name }}_real way, {{ name }}_real v, {{ name }}_real a, {{ name }}_real h) {
+  const {{ name }}_real middle = {{ half }} * h;
+  const {{ name }}_real left = way - (middle * v);
+  return (left > {{ zero }}) ? (a * ({{ name }}_root((middle * middle) + (({{ two }} * left) / a)) - middle)) : {{ zero }};
+}
+
+/* How far references may go: those of requests by their limit, others as far as the machine, or where it is already. */
+static {{ name }}_real end_for(const {{ name }}_supervisor *sup, {{ name }}_real p, int32_t k) {
+  const {{ name }}_real goal = size_of(sup->place[k]);
+  const {{ name }}_real here = size_of(p);
+  {{ name }}_real end = (sup->state == {{ NAME }}_OPERATE) ? {{ farthest }}[k] : near_touch[k];
+  if (sup->state != {{ NAME }}_OPERATE) {
+    end = (goal > end) ? goal : end;
+  }
+  return (here > end) ? here : end;
+}
+
+/* The next reference of an output. One that the last one leads to within the limits, and from which it can still stop, is
+   used as it is. Another one is approached in the shortest time, with three quarters of the acceleration, or with all of
+   it where the way ends: then 1 is returned. */
+static int32_t steer(const {{ name }}_supervisor *sup, {{ name }}_reference *last, const {{ name }}_reference *next,
+                     const {{ name }}_request *request, int32_t k) {
+  const int32_t steps = missed_of(request) + 1;
+  const {{ name }}_real h = ({{ name }}_real)steps * {{ NAME }}_SAMPLE_TIME;
+  const {{ name }}_real p = last->p[k];
+  const {{ name }}_real v = last->dp[k];
+  const {{ name }}_real rate = next->dp[k];
+  const {{ name }}_real a = {{ steepest }}[k];
+  const {{ name }}_real end = end_for(sup, p, k);
+  const {{ name }}_real room = (rate > {{ zero }}) ? (end - next->p[k]) : (end + next->p[k]);
+  const {{ name }}_real off = (next->p[k] - p) - (({{ half }} * h) * (v + rate));
+  const int32_t even = is_within(rate - v, {{ exceeding }} * (a * h));
+  const int32_t joined = is_within(off, ({{ rounding }} * end) + ({{ half }} * (a * (h * h))));
+  const bool stops = (rate * rate) <= ({{ two }} * (a * (({{ exceeding }} * room) + ({{ rounding }} * end))));
+  int32_t steered = 0;
+  if (((even + joined) == 2) && stops) {
+    last->p[k] = next->p[k];
+    last->dp[k] = next->dp[k];
+    last->ddp[k] = next->ddp[k];
+  } else {
+    const {{ name }}_real most = {{ gentle }} * a;
+    const {{ name }}_real left = most - size_of(next->ddp[k]);
+    const {{ name }}_real own = (left > ({{ least_share }} * a)) ? left : ({{ least_share }} * a);
+    const {{ name }}_real way = (next->p[k] - (h * rate)) - p;
+    const {{ name }}_real sign = (way < {{ zero }}) ? -{{ one }} : {{ one }};
+    const {{ name }}_real goal = rate + (sign * speed_for(sign * way, sign * (v - rate), own, h));
+    const {{ name }}_real near = between(v - (most * h), goal, v + (most * h));
+    const {{ name }}_real slow = between(-{{ fastest }}[k], near, {{ fastest }}[k]);
+    const {{ name }}_real now = between(-speed_for(end + p, -v, a, h), slow, speed_for(end - p, v, a, h));
+    last->p[k] = between(-end, p + (({{ half }} * h) * (v + now)), end);
+    last->dp[k] = now;
+    last->ddp[k] = (now - v) / h;
+    steered = 1;
+  }
+  return steered;
+}
+
 /* The reference of a sample: the goal, and what is left of the difference at the beginning. */
 static void guide({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_request *request) {
   const {{ name }}_real t = ({{ name }}_real)sup->samples * {{ NAME }}_SAMPLE_TIME;
@@ -889,37 +1285,49 @@ static void guide({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name
       fade_acceleration(t, sup->d2[k], &next, k);
     }
   }
+  sup->steered = 0;
   for (k = 0; k < OUTPUTS; k++) {
-    /* a fade may pass a limit of requests, but no reading's range; its numbers are finite as those that it joins are */
+    /* what is requested and faded to is finite, of a possible size, and within the limits from here on */
     if ((is_within(next.p[k], range[k]) + is_within(next.dp[k], {{ most_rate }}) + is_within(next.ddp[k], {{ most_rate }})) == 3) {
-      s->reference.p[k] = next.p[k];
-      s->reference.dp[k] = next.dp[k];
-      s->reference.ddp[k] = next.ddp[k];
+      if (steer(sup, &s->reference, &next, request, k) == 1) {
+        sup->steered++;
+      }
     }
   }
 }
 
 {% if fallback %}
-/* The nearest place along the stroke for which there is a gain. */
-static int32_t place_of(const {{ name }}_real expected[OUTPUTS]) {
-{% if places > 1 %}
-  const {{ name }}_real along = ((expected[{{ stroke_output }}] - ({{ first_place }})) / {{ apart }}) + {{ half }};
-  const {{ name }}_real most = ({{ name }}_real){{ places - 1 }};
-  int32_t place = 0;
-  if (along > most) {
-    place = {{ places - 1 }};
-  } else if (along > {{ zero }}) {
-    place = (int32_t)along;
-  } else {
-    /* the first */
+{% if rejoined %}
+/* Where sensors are believed again the filter's places become theirs, and its rates stay: a filter that is off for long
+   would take the difference of one sample for a speed. */
+static bool rejoin(const {{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_inputs *in,
+                   const {{ name }}_real expected[OUTPUTS], const int32_t before[OUTPUTS]) {
+  static const {{ name }}_real places[{{ rates }}][OUTPUTS] = { /* of readings */
+{{ rejoined }}
+  };
+  bool again = false;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if ((before[k] > 0) && (sup->unbelieved[k] == 0)) {
+      int32_t i;
+      again = true;
+      for (i = 0; i < {{ rates }}; i++) {
+        const {{ name }}_real part = places[i][k] * (in->y[k] - expected[k]);
+        s->xi_pred[i] = s->xi_pred[i] + part;
+      }
+    }
   }
-  return place;
-{% else %}
-  (void)expected;
-  return 0;
-{% endif %}
+  return again;
 }
 
+{% endif %}
+{% if places > 1 %}
+/* Where the machine is along the stroke, in distances of places that have a gain, from the first to the last. */
+static {{ name }}_real place_along(const {{ name }}_real expected[OUTPUTS]) {
+  return between({{ zero }}, (expected[{{ stroke_output }}] - ({{ first_place }})) / {{ apart }}, ({{ name }}_real){{ places - 1 }});
+}
+
+{% endif %}
 {% endif %}
 {% if fallback %}
 /* The filter without the sensors that are not believed: one of them by a gain for the others, where there is one. */
@@ -940,14 +1348,29 @@ static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, 
       number++;
     }
   }
-  if ((number == 1) && (has_gain[without] == 1)) {
-    const int32_t place = place_of(expected);
+  const bool held = (number == 1) && (without == sup->leapt) && (sup->unbelieved[without] <= {{ held }});
+  if (held) {
+    for (k = 0; k < OUTPUTS; k++) {
+      seen->y_valid[k] = {{ zero }}; /* another may lie too */
+    }
+  } else if ((number == 1) && (has_gain[without] == 1)) {
+{% if places > 1 %}
+    const {{ name }}_real way = place_along(expected);
+    const int32_t place = (way < ({{ name }}_real){{ places - 2 }}) ? (int32_t)way : {{ places - 2 }};
+    const {{ name }}_real share = way - ({{ name }}_real)place; /* of the gain of the next place */
+{% endif %}
     int32_t i;
     for (i = 0; i < STATES; i++) {
       {{ name }}_real sum = s->xi_pred[i];
       for (k = 0; k < OUTPUTS; k++) {
         if (k != without) {
-          const {{ name }}_real part = gain_without[without][place][i][k] * (seen->y[k] - expected[k]);
+{% if places > 1 %}
+          const {{ name }}_real first = gain_without[without][place][i][k];
+          const {{ name }}_real gain = first + (share * (gain_without[without][place + 1][i][k] - first));
+{% else %}
+          const {{ name }}_real gain = gain_without[without][0][i][k];
+{% endif %}
+          const {{ name }}_real part = gain * (seen->y[k] - expected[k]);
           sum = sum + part;
         }
       }
@@ -957,6 +1380,8 @@ static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, 
       seen->y_valid[k] = {{ zero }}; /* the estimate is made */
     }
     estimated = 1;
+  } else {
+    /* all others are seen */
   }
   return estimated;
 }
@@ -1003,6 +1428,21 @@ static void rest_bridges(const {{ name }}_inputs *in, {{ name }}_outputs *out) {
   }
 }
 
+{% if excited %}
+/* Forces beside the law's are for a machine in operation, and within limits of their own. */
+static void gate_excitation(const {{ name }}_supervisor *sup, {{ name }}_inputs *seen) {
+  static const {{ name }}_real most[{{ forces }}] = { {{ excitation }} };
+  bool used = sup->state == {{ NAME }}_OPERATE;
+  int32_t k;
+  for (k = 0; k < {{ forces }}; k++) {
+    used = used && (is_within(seen->excitation[k], most[k]) == 1);
+  }
+  for (k = 0; k < {{ forces }}; k++) {
+    seen->excitation[k] = used ? seen->excitation[k] : {{ zero }};
+  }
+}
+
+{% endif %}
 /* Entry by entry: a compiler may call memcpy for a record. */
 static void copy_inputs(const {{ name }}_inputs *in, {{ name }}_inputs *seen) {
   int32_t k;
@@ -1019,9 +1459,15 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
   {{ name }}_real expected[OUTPUTS];
   {{ name }}_real level[{{ monitors | length }}][OUTPUTS];
   int32_t reaction;
+{% if rejoined %}
+  int32_t before[OUTPUTS];
+{% endif %}
   int32_t k;
   copy_inputs(in, &seen);
 {% if tunable %}
+  if (sup->calibration != NULL) {
+    {{ name }}_calibration_take(sup->calibration, s);
+  }
   sup->parameters = s->parameters;
 {% endif %}
 {% if currents %}
@@ -1038,28 +1484,58 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
 {% if stars %}
   infer_currents(sup, &seen);
 {% endif %}
+{% if rates %}
+  if ((is_flying(sup->state) == 1) && (request->missed > 0)) {
+    coast(s, request);
+  }
+{% endif %}
   expect(sup, s, in, expected);
   look(sup, s, &seen, request, expected, level);
+{% if rejoined %}
+  for (k = 0; k < OUTPUTS; k++) {
+    before[k] = sup->unbelieved[k];
+  }
+{% endif %}
   reaction = judge(sup, level);
+{% if rejoined %}
+  if ((is_flying(sup->state) == 1) && rejoin(sup, s, in, expected, before)) {
+    expect(sup, s, in, expected);
+  }
+{% endif %}
   if ((sup->state == {{ NAME }}_SENSORS) && (sup->steady > 0)) {
     average_rest(sup);
   }
+{% if wiring %}
+  if (sup->state == {{ NAME }}_WIRING) {
+    wire(sup, &seen);
+  }
+{% endif %}
   if (sup->state == {{ NAME }}_SETTLE) {
     count_settled(sup, s, in);
   }
   if (sup->state == {{ NAME }}_LANDING) {
     count_landed(sup, in);
   }
+{% if tunable %}
+  refuse_start(sup, request);
+{% endif %}
   change_state(sup, s, request, event_of(sup, request, reaction));
-  remember(sup, &request->reference);
+  remember(sup, request);
   sup->started = request->start;
   sup->acknowledged = request->acknowledge;
+{% if wiring %}
+  sup->enable = (sup->state == {{ NAME }}_WIRING) ? 1 : is_flying(sup->state);
+{% else %}
   sup->enable = is_flying(sup->state);
+{% endif %}
   if (is_flying(sup->state) == 1) {
 {% if fallback %}
     int32_t estimated;
 {% endif %}
     guide(sup, s, request);
+{% if excited %}
+    gate_excitation(sup, &seen);
+{% endif %}
 {% if fallback %}
     estimated = leave_out(sup, s, expected, &seen);
 {% if logged %}
@@ -1098,6 +1574,11 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
 {% endif %}
   } else {
     rest_bridges(in, out);
+{% if wiring %}
+    if (sup->state == {{ NAME }}_WIRING) {
+      push(sup, out);
+    }
+{% endif %}
 {% if currents %}
     for (k = 0; k < {{ coils }}; k++) {
       sup->current[k] = {{ zero }};

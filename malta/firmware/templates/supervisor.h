@@ -13,13 +13,25 @@
    {{ line }}
 {% endfor %}
 
+   References go to their requests within the limits, and so that they can still stop before the end of the way. A request
+   that is within them is used as it is; of one whose rate is not that of its places, the place alone.
+
    ignore: the filter goes on without the reading, with a gain for the other sensors where there is one; a reading is
-   believed again when it is near what the filter expects. hold: the reference stops. land: down to the place where the
+   believed again after some samples near what the filter expects, soon after it was lost or never. hold: the reference stops. land: down to the place where the
    machine rested. fault: bridges at zero voltage until acknowledged.
 
    {{ name }}_supervisor_init tries the arithmetic of the compiled text, {{ name }}_self_test(). Where that is
    not what is written (`fit` is 0), the machine stays off.
 
+{% if wiring %}
+   Before the first lift-off the wiring is tried, with {{ wiring_share }} % of the limits of forces at most; `wired` is then 1,
+   or -1 and a fault: `shows` has the output that each reading shows, from 1 on and negative where it is inverted, 0 for
+   none, and `gain` how much of it; `coil` what each command drives, from 0 on, `turned` -1 where it is inverted; `reads` the
+   current of each sensor, as `shows`; `at` the place of the table of the stroke where the currents are commutated as they
+   should be; `doubt` is not -1 where another mistake has the same answers. malta's `wiring_sentences` says it in words.
+   Set `wired` to 1 to leave it out.
+
+{% endif %}
    At every sample, in place of {{ name }}_step:
      {{ name }}_supervisor_step(&supervisor, &state, &inputs, &request, &outputs).                                      */
 #ifndef {{ NAME }}_SUPERVISOR_H
@@ -46,6 +58,12 @@ extern "C" {
 #define {{ NAME }}_REACTION_{{ key }} {{ loop.index0 }}
 {% endfor %}
 
+{% if tunable %}
+/* Why a start is refused, beside the reasons of {{ NAME }}_PARAMETERS. */
+#define {{ NAME }}_START_ARITHMETIC 10 /* the compiled arithmetic is not that of the text */
+#define {{ NAME }}_START_STOPPED 11    /* an emergency stop, or safe torque off */
+
+{% endif %}
 #define {{ NAME }}_MONITOR_ROWS {{ rows | length }}
 
 /* A row of the table of monitors. */

@@ -98,7 +98,7 @@ static void fly_sample(record *all, flight *f, const {{ name }}_request *request
 }
 
 static void read_machine(flight *f) {
-{% if driven %}
+{% if driven or model is defined %}
   read_stand_in(&f->machine, f->sup.enable, &f->s, &f->out, &f->in);
 {% else %}
   read_stand_in(&f->machine, f->sup.enable, &f->s, &f->in);
@@ -106,6 +106,9 @@ static void read_machine(flight *f) {
 }
 
 static void shorten({{ name }}_supervisor *sup) {
+{% if wiring %}
+  sup->wired = 1; /* the stand-in has none */
+{% endif %}
   sup->times.offsets = {{ 20 if driven else 0 }};
   sup->times.check = 20;
   sup->times.lift = 100;
@@ -140,7 +143,7 @@ static void fly(record *all) {
   }
   for (k = 0; k < WISHES; k++) {
     int32_t samples = 0;
-    while ((f.sup.state != wishes[k].until) && (samples < 2000)) {
+    while ((f.sup.state != wishes[k].until) && (samples < {{ longest_wish }})) {
       samples++;
       read_machine(&f);
       fly_sample(all, &f, &wishes[k].request);
@@ -185,10 +188,10 @@ static void take_over(record *all) {
 
 {% if driven %}
 /* Faults of currents and of the link; n: samples since the fault began. */
-static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
+static void disturb_currents(flight *f, const {{ name }}_monitor *row, int32_t n) {
   static {{ name }}_real held[{{ currents }}];
   int32_t k;
-  switch (monitor) {
+  switch (row->monitor) {
   case {{ NAME }}_MONITOR_CURRENT:
     f->in.i[n % {{ currents }}] = {{ over.current }};
     break;
@@ -212,7 +215,7 @@ static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
     }
     break;
   case {{ NAME }}_MONITOR_CURRENT_SUM:
-    f->in.i[0] = f->in.i[0] + {{ over.uneven }};
+    f->in.i[0] = f->in.i[0] + ({{ over.factor }} * row->threshold);
     break;
   case {{ NAME }}_MONITOR_CURRENT_FROZEN:
     for (k = 0; k < {{ currents }}; k++) {
@@ -232,25 +235,76 @@ static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
 }
 
 {% endif %}
+{% if not tracks_errors %}
+/* The filter expects these readings, but of the sensor k this much more, by the smallest change of what it remembers: no
+   monitor of another cause acts. Where the filter knows less than is read, the other readings too are off. */
+static void let_expect(flight *f, const {{ name }}_real readings[{{ outputs }}], int32_t k, {{ name }}_real more) {
+  static const {{ name }}_real shows[{{ outputs }}][{{ estimated }}] = { {{ shows }} };
+  static const {{ name }}_real told[{{ estimated }}][{{ outputs }}] = { {{ told }} }; /* states by readings */
+  static const {{ name }}_real alone[{{ estimated }}][{{ outputs }}] = { {{ alone }} }; /* by one that shall be right */
+  {{ name }}_real off[{{ outputs }}];
+  int32_t j;
+  int32_t i;
+  for (i = 0; i < {{ outputs }}; i++) {
+    off[i] = readings[i];
+    for (j = 0; j < {{ estimated }}; j++) {
+      off[i] = off[i] - (shows[i][j] * f->s.xi_pred[j]);
+    }
+  }
+  for (j = 0; j < {{ estimated }}; j++) {
+    for (i = 0; i < {{ outputs }}; i++) {
+      f->s.xi_pred[j] = f->s.xi_pred[j] + (told[j][i] * off[i]);
+    }
+    f->s.xi_pred[j] = f->s.xi_pred[j] + (alone[j][k] * more);
+  }
+}
+
+/* What the filter expects at a fault: the readings, but of the sensor k where the fault is the filter's. */
+static void disturb_expectation(flight *f, int32_t monitor, int32_t k, int32_t n) {
+  static const {{ name }}_real shift[{{ outputs }}] = { {{ over.shift }} };
+  static const {{ name }}_real astray[{{ outputs }}] = { {{ over.astray }} };
+  {{ name }}_real expects[{{ outputs }}];
+  {{ name }}_real more = {{ zero }};
+  bool agrees = true;
+  int32_t j;
+  for (j = 0; j < {{ outputs }}; j++) {
+    const bool is_read = (f->in.y[j] <= astray[j]) && (f->in.y[j] >= -astray[j]); /* a NaN is not */
+    expects[j] = is_read ? f->in.y[j] : f->s.reference.p[j];
+  }
+  switch (monitor) {
+  case {{ NAME }}_MONITOR_INNOVATION: /* by and by: at once the filter would be lost */
+    more = shift[k] * ((n < {{ slowly }}) ? (({{ name }}_real)n / {{ slowly_real }}) : {{ one }});
+    break;
+  case {{ NAME }}_MONITOR_STROKE:
+    more = {{ over.factor }} * shift[k];
+    break;
+  case {{ NAME }}_MONITOR_ASTRAY:
+    more = astray[k] - expects[k];
+    break;
+  case {{ NAME }}_MONITOR_TOUCH:
+  case {{ NAME }}_MONITOR_FOLLOWING:
+  case {{ NAME }}_MONITOR_UNSETTLED:
+  case {{ NAME }}_MONITOR_SATURATION: /* the stand-in answers no force */
+  case {{ NAME }}_MONITOR_HELPLESS:
+    break;
+  default:
+    agrees = false;
+    break;
+  }
+  if (agrees) {
+    let_expect(f, expects, k, more);
+  }
+}
+
+{% endif %}
 /* Faults of the filter's memory and of the law's sums: what a broken machine or a flipped bit does to them. */
-static void disturb_states(flight *f, int32_t monitor, int32_t k{{ ", int32_t n" if reached is defined }}) {
+static void disturb_states(flight *f, int32_t monitor{{ ", int32_t k" if tracks_errors }}{{ ", int32_t n" if reached is defined }}) {
 {% if tracks_errors %}
 {% if over.saturating is defined %}
   static const {{ name }}_real saturating[{{ estimated }}] = { {{ over.saturating }} };
 {% endif %}
   if (monitor == {{ NAME }}_MONITOR_ASTRAY) {
     f->s.reference.p[k] = beyond_range[k];
-  }
-{% else %}
-  static const int32_t seen[{{ outputs }}] = { {{ seen }} }; /* the state that a reading shows most */
-  static const {{ name }}_real per_unit[{{ outputs }}] = { {{ over.per_unit }} };
-  static const {{ name }}_real shift[{{ outputs }}] = { {{ over.shift }} };
-  static const {{ name }}_real astray[{{ outputs }}] = { {{ over.astray }} };
-  if (monitor == {{ NAME }}_MONITOR_INNOVATION) {
-    f->s.xi_pred[seen[k]] = (f->s.reference.p[k] * per_unit[k]) + shift[k];
-  }
-  if (monitor == {{ NAME }}_MONITOR_ASTRAY) {
-    f->s.xi_pred[seen[k]] = astray[k];
   }
 {% endif %}
   if ((monitor == {{ NAME }}_MONITOR_SATURATION) || (monitor == {{ NAME }}_MONITOR_HELPLESS)) {
@@ -286,7 +340,12 @@ static void disturb_sensors(flight *f, int32_t monitor, int32_t k, int32_t n) {
   int32_t j;
   switch (monitor) {
   case {{ NAME }}_MONITOR_TOUCH:
-    f->in.y[k] = f->in.y[k] + ((drift < beyond_touch[k]) ? drift : beyond_touch[k]);
+    f->in.y[k] = (drift < beyond_touch[k]) ? drift : beyond_touch[k]; /* where its reference is, or was left */
+    f->s.reference.p[k] = f->in.y[k];
+    f->in.y[k] = f->in.y[k] + f->machine.drawn[k];
+    break;
+  case {{ NAME }}_MONITOR_FOLLOWING:
+    f->in.y[k] = f->in.y[k] + drift;
     break;
   case {{ NAME }}_MONITOR_UNSETTLED:
 {% if tracks_errors %}
@@ -370,10 +429,13 @@ static void fly_with_fault(record *all, flight *f, const {{ name }}_monitor *row
 {% endif %}
   read_machine(f);
 {% if driven %}
-  disturb_currents(f, row->monitor, n);
+  disturb_currents(f, row, n);
 {% endif %}
   disturb_sensors(f, row->monitor, k, n);
-  disturb_states(f, row->monitor, k{{ ", n" if reached is defined }});
+  disturb_states(f, row->monitor{{ ", k" if tracks_errors }}{{ ", n" if reached is defined }});
+{% if not tracks_errors %}
+  disturb_expectation(f, row->monitor, k, n);
+{% endif %}
   disturb_request(&request, row, f->sup.state, k);
   fly_sample(all, f, &request);
 }
@@ -388,6 +450,9 @@ static void hurry({{ name }}_supervisor *sup, int32_t r, int32_t k, int32_t n) {
     if ((*count >= HURRIED) && (*count < (row->samples - HURRIED))) {
       *count = row->samples - HURRIED;
     }
+  }
+  if ((n == 0) && (row->monitor == {{ NAME }}_MONITOR_OVERRUN)) {
+    sup->late = row->threshold; /* the stand-in does not move on over steps that are missed, as the filter does */
   }
   if (n == HURRIED) {
     if ((row->monitor == {{ NAME }}_MONITOR_STUCK) && (same_values[k] > (2 * HURRIED))) {
@@ -455,8 +520,8 @@ static void believe_again(record *all, flight *f, const {{ name }}_monitor *row,
   if (f->sup.unbelieved[k] == 0) {
     complain(all, "a sensor is believed: monitor and sensor", row->monitor, k);
   }
-  for (n = 0; n < HURRIED; n++) {
-    fly_with_fault(all, f, &no_fault, k, n);
+  for (n = 0; (n < {{ longest_disbelief }}) && (f->sup.unbelieved[k] != 0); n++) {
+    fly_with_fault(all, f, &no_fault, k, n); /* the more good readings, the more often it was wrong */
   }
   if (f->sup.unbelieved[k] != 0) {
     complain(all, "a sensor is not believed again: monitor and sensor", row->monitor, k);
@@ -474,6 +539,9 @@ static void try_row(record *all, int32_t r, int32_t from, int32_t k) {
   int32_t state = from;
   int32_t n = 0;
   f = all->at[from];
+{% if model is defined %}
+  f.machine.still = 1;
+{% endif %}
   f.sup.times.offsets = 25;
   f.sup.times.check = {{ longest }};
   f.sup.times.lift = {{ longest }};

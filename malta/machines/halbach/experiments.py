@@ -1,12 +1,7 @@
 """The experiments on the Halbach linear motor.
 
 step     100 um there and back, with every source of error, Fig. 9
-stairs   steps of 10 um: open loop and position control, plain and high-resolution PWM, Fig. 7
 ramp     50 mm at constant speed, Fig. 8
-force    the vertical force of a move of 5 mm under three control laws, Fig. 10, sound and with faults
-budget   the error of a motor at rest by source, Sec. 5.1
-identify the step of 2 mm in the open loop from which the paper identified mass and friction, Sec. 2.3; A, k and l from
-         a load cell's record, Sec. 2.1
 
 Electronics run period by period at fidelity "phase", which is the default; campaigns run at fidelity "force".
 
@@ -17,34 +12,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.halbach import electronics
-from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, IQ_BITS, MEAN_SAMPLES, Options, Pwm
-from malta.machines.halbach.open_loop import MAX_FORCE, force, identify, lift_deviation, stairs
+from malta.machines.halbach.electronics import MEAN_SAMPLES, Options, Pwm
 from malta.model.plant import Plant
 from malta.simulation import references
-from malta.simulation.experiments import (
-    AS_BUILT,
-    NO_NOISE,
-    Experiment,
-    Merit,
-    PlannedRun,
-    Progress,
-    experiment_of,
-    fly,
-    rms,
-    scenario_of,
-)
+from malta.simulation.experiments import Experiment, Merit, PlannedRun, experiment_of, rms, scenario_of
 from malta.simulation.references import Motion, Reference
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
+
+
+def lift_deviation(run: Trajectory) -> float:
+    """Largest relative difference of the vertical force from the commanded one; NaN if that is 0."""
+    F_z = commanded_lift(run)
+    return float(np.abs(lift_force(run) / F_z - 1).max()) if F_z else math.nan
+
+
+def commanded_lift(run: Trajectory) -> float:
+    """The vertical force in the controller's parameters, N."""
+    believed: Any = run.controller.parameters
+    return float(believed.F_z)
+
+
+def lift_force(run: Trajectory) -> FloatArray:
+    """The vertical force at all samples, N; at fidelity "force" that of the commanded currents."""
+    par: Any = run.plant.parameters
+    return electronics.vertical_force(par, run.x[:, 0], run.i_phase if run.i_phase.size else run.current)
+
 
 # Options of the electronics in an experiment.
 
@@ -61,75 +62,6 @@ def electronics_options(
 def in_campaigns(cases: Callable[..., list[PlannedRun]]) -> Callable[..., list[PlannedRun]]:
     """The same runs with fidelity "force", unless the options name another."""
     return lambda plant, controller, **options: cases(plant, controller, **{"fidelity": "force"} | options)
-
-
-# The error of the Halbach motor at rest, by source: Sec. 5.1.
-
-
-class Source(NamedTuple):
-    """A source of error: the electronics and the sensors that have it alone."""
-
-    parts: Options
-    sensors: dict[str, Any]
-    aside: float = 0.0  # m, beside the place of the budget
-
-
-SOURCES: Mapping[str, Source] = {
-    "laser": Source(IDEAL_ELECTRONICS, AS_BUILT),
-    "current noise": Source(replace(IDEAL_ELECTRONICS, adc_noise=True), NO_NOISE),
-    "current steps": Source(replace(IDEAL_ELECTRONICS, adc_steps=True), NO_NOISE),
-    "PWM": Source(replace(IDEAL_ELECTRONICS, pwm="plain"), NO_NOISE),
-    f"angle of {IQ_BITS} bits": Source(
-        replace(IDEAL_ELECTRONICS, angle_bits=IQ_BITS), NO_NOISE, 0.3e-3
-    ),  # exact at x = 0
-    "all": Source(electronics.REAL_ELECTRONICS, AS_BUILT),
-    "all, fine PWM": Source(replace(electronics.REAL_ELECTRONICS, pwm="fine"), AS_BUILT),
-}
-RUN_READINGS, FIRST_READING = 500, 40  # readings of a run, and the first of them that counts
-PLACES_ALONG = 7  # places along half a pitch, for current noise alone
-
-
-def budget(
-    plant: Plant,
-    controller: Controller,
-    *,
-    place: float = 0.0,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Experiment:
-    """Rest at `place` (m) with each source of error alone, and with all; current noise along half a pitch.
-
-    The fixed-point angle is not among all: the paper prints no format.
-    """
-    believed: Any = controller.parameters
-    spots = np.linspace(0, math.pi / believed.k, PLACES_ALONG)
-    asked = [(name, *source[:2], place + source.aside) for name, source in SOURCES.items()]
-    asked += [(f"current noise at {1e3 * x:.1f} mm", *SOURCES["current noise"][:2], float(x)) for x in spots]
-    wanted = []
-    for label, parts, sensors, x in asked:
-        own = {"fidelity": "phase", "electronics": parts} | sensors
-        reference = partial(references.hold, x=x)
-        scenario = scenario_of("budget", RUN_READINGS * controller.sample_time, reference, own | options)
-        wanted.append(PlannedRun(label, scenario, _rest_merits))
-    flown, cut = fly(plant, controller, wanted, progress, options)
-    shown, along = flown[: len(SOURCES)], flown[len(SOURCES) :]
-    found = np.array([case.merits[0].value for case in along])
-    ends = (("best", found.min(initial=math.inf)), ("worst", found.max(initial=0.0))) if len(found) else ()
-    merits = tuple(Merit(f"current noise, at the {end} place", float(value), "um") for end, value in ends)
-    curves = {"place": spots[: len(found)], "rms": found}
-    return Experiment("budget", "What keeps it from standing still?", shown, merits, curves, interrupted=cut)
-
-
-def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Rms, mean and peak to peak of the position error after the first readings."""
-    error = (run.p - run.reference)[FIRST_READING:, 0]
-    if len(error) == 0:
-        error = np.array([math.nan])
-    return (
-        Merit("position, rms", float(error.std()), "um"),
-        Merit("mean error", abs(float(error.mean())), "um"),
-        Merit("peak to peak", float(np.ptp(error)), "um"),
-    )
 
 
 STEP, COUNT = 100e-6, 20  # m, Fig. 9
@@ -270,11 +202,7 @@ def _ramp_merits(run: Trajectory, start: float, moving: float) -> tuple[Merit, .
 
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "step": experiment_of("step", "Does it go where it is sent, and stay?", step_cases),
-    "stairs": stairs,
     "ramp": experiment_of("ramp", "Does it follow through the whole travel?", ramp_cases),
-    "force": force,
-    "budget": budget,
-    "identify": identify,
 }
 CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "step": in_campaigns(step_cases),
@@ -282,7 +210,7 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
 }
 ALONE = ("step", "ramp")
 WORDS = {"stroke": "position", "thrust": "force"}
-OPTION_UNITS = {"distance": "m", "rise": "s", "speeds": "m/s", "place": "m", "F_z": "N"}
+OPTION_UNITS = {"distance": "m", "rise": "s", "speeds": "m/s"}
 
 
 def check(name: str, option: str, value: Any) -> None:
@@ -293,16 +221,8 @@ def check(name: str, option: str, value: Any) -> None:
         raise InputError("simulate", f"{name}: {option}", repr(value), "1 to 1000 steps")
     elif option == "rise":
         references.check_rise(value)
-    elif option == "F_z" and not 0 < value <= MAX_FORCE:
-        raise InputError("simulate", f"{name}: F_z", f"{value:g} N", f"above 0 and at most {MAX_FORCE:g} N")
-    elif option in ("distance", "speeds", "place"):
+    elif option in ("distance", "speeds"):
         values = value if option == "speeds" else (value,)
-        if not all(
-            math.isfinite(v) and (v > 0 or option == "place" or (v and option == "distance")) for v in values
-        ):
-            expected = (
-                "above 0"
-                if option == "speeds"
-                else "finite" + ("" if option == "place" else ", other than 0")
-            )
+        if not all(math.isfinite(v) and (v > 0 or (v and option == "distance")) for v in values):
+            expected = "above 0" if option == "speeds" else "finite, other than 0"
             raise InputError("simulate", f"{name}: {option}", repr(value), expected)

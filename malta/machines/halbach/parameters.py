@@ -16,13 +16,13 @@ GAP = 0.4e-3
 class Parameters:
     """Physical parameters, SI. data/halbach.toml has the source of each."""
 
-    A: float = si("N/A", above=0)  # motor constant, of Id and Iq
+    A: float = si("motor constant [N/A]", above=0)  # motor constant, of Id and Iq
     k: float = si("rad/m", above=0)  # wave number
-    m: float = si("kg", above=0)  # moving stator
-    b: float = si("N s/m", at_least=0)  # viscous friction
+    m: float = si("mass [kg]", above=0)  # moving stator
+    b: float = si("friction [N s/m]", at_least=0)  # viscous friction
     K_e: float = si("V s/m", at_least=0)  # induced voltage of a phase
-    R: float = si("ohm", above=0)  # phase winding
-    L: float = si("H", above=0)
+    R: float = si("resistance [ohm]", above=0)  # phase winding
+    L: float = si("inductance [H]", above=0)
     V_dc: float = si("V", above=0)
     f_pwm: float = si("Hz", above=0, shapes=True)
     counts: float = si("1", above=0)  # steps of a duty cycle

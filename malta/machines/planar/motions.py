@@ -1,4 +1,4 @@
-"""The published steps of the planar motor, with each coil model and with filters of different speeds."""
+"""The published steps of the planar motor with each coil model: as quintics, and as jumps that saturate."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from malta.simulation.references import Motion, Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg
 from malta.synthesis.weighting import weights_of
 
@@ -117,23 +116,6 @@ def step_cases(
     return wanted
 
 
-PREDICTION = "place predicted"
-
-
-def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experiment:
-    """The published steps from PLACE with currents for where they will act, by the exact coils.
-
-    The same controller, but for its commutation (`commutate_ahead`); design files ask for it by `commutation`.
-    """
-    moves: dict[str, Any] = {"place": PLACE, "gap": GAP, "lift": LIFT, "distance": DISTANCE}
-    wanted = step_cases(plant, controller, **moves, **options)[0]
-    believed = planar.plant(parameters_of(controller))
-    ahead = commutate_ahead(controller, linearize(believed, believed.point(controller.operating_point[0])))
-    flights = [(plant, with_coil_model(ahead, "exact"), wanted._replace(label=f"exact, {PREDICTION}"))]
-    cases, cut = fly_all(flights, None, options)
-    return Experiment("step", "What is left when currents are where they act?", cases, (), interrupted=cut)
-
-
 FORCES: dict[str, Any] = NO_NOISE | {
     "fidelity": "force",
     "substeps": 1,
@@ -185,7 +167,7 @@ def step_merits(run: Trajectory) -> tuple[Merit, ...]:
         Merit("y within 10 um after its step", arrival(run, target[1]), "ms", key="y_settled"),
         Merit("y, overshoot", max(float(beyond.max()), 0.0), "um"),
         Merit(
-            "z, from 20 ms after its step", _largest(np.abs(run.p[late, 2] - target[2])), "um", key="z_late"
+            "z, from 20 ms after its step", largest_of(np.abs(run.p[late, 2] - target[2])), "um", key="z_late"
         ),
         *(
             Merit(f"{signal.name}, deviation", float(error[:, k].max()), "um" if k < 3 else "urad")
@@ -205,7 +187,7 @@ def arrival(run: Trajectory, target: float) -> float:
     return float(run.t[off[-1] + 1]) - MOVE_AT
 
 
-def _largest(values: FloatArray) -> float:
+def largest_of(values: FloatArray) -> float:
     """The largest value; NaN without any."""
     return float(values.max()) if values.size else math.nan
 
@@ -228,68 +210,6 @@ def _path_deviations(cases: Sequence[Case]) -> tuple[Merit, ...]:
                     Merit(f"{model} moves {signal.name} by", float(off[k]), "um" if k < 3 else "urad")
                 )
     return tuple(merits)
-
-
-def delay(
-    plant: Plant,
-    controller: Controller,
-    *,
-    speeds: tuple[float, ...] = (1.0, 2.0, 3.0),
-    place: tuple[float, ...] = PLACE,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Experiment:
-    """The steps with filters that know of the sample of computation and with such that do not.
-
-    speeds : of the regulator and the filter, in multiples of the controller's own
-
-    Raises InputError for a PID, which predicts nothing.
-    """
-    if controller.cost is None or controller.noise is None:
-        raise InputError("simulate", "scenario", "'delay' with a PID, which predicts nothing", "an LQG")
-    moves: dict[str, Any] = {"place": place, "gap": GAP, "lift": LIFT, "distance": DISTANCE}
-    wanted = step_cases(plant, controller, **moves, **options)[0]._replace(merits=_rest_merits)
-    flights = [
-        (
-            plant,
-            scale_speed(controller, speed, controller.delay if knows else 0),
-            wanted._replace(label=f"{'with' if knows else 'without'}, {speed:g} x"),
-        )
-        for speed in speeds
-        for knows in (True, False)
-    ]
-    cases, cut = fly_all(flights, progress, options)
-    return Experiment("delay", "Does the filter have to know of the delay?", cases, (), interrupted=cut)
-
-
-def scale_speed(controller: Controller, speed: float, delay: float) -> Controller:
-    """The LQG of the same cost and noise, `speed` times as fast, with `delay` samples in its design model.
-
-    Natural frequencies of a double integrator go with the fourth root of q / r, those of its filter with the fourth
-    root of the ratio of variances; the filter then follows disturbances `speed` times as fast.
-    """
-    plant, own = planar.plant(parameters_of(controller)), weights_of(controller)
-    weights = replace(
-        own,
-        q=own.q * speed**4,
-        process_variance=own.process_variance * speed**4,
-        drift_variance=own.drift_variance * speed**6,
-    )
-    model = linearize(plant, plant.point(controller.operating_point[0]))
-    return lqg(
-        model, weights, controller.sample_time, "sampled-data", delay, name=controller.name, solver="scipy"
-    )
-
-
-def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Largest deviation of the angles, and the errors in the last tenth of the run."""
-    error = np.abs(run.p - run.reference)
-    late = error[run.t >= 0.9 * run.scenario.duration]
-    return (
-        Merit("angles, largest deviation", float(error[:, 3:].max()), "urad"),
-        Merit("angles, left at rest", _largest(late[:, 3:]), "urad"),
-        Merit("position, left at rest", _largest(late[:, :3]), "um"),
-    )
 
 
 # The published steps of the planar motor as the paper commands them: jumps of the reference.
@@ -336,24 +256,14 @@ def jump(
     by_table = with_coil_model(controller, "table", cells)
     laws = {f"table, {DESIGN_END}": by_table, f"table, {LINEAR_END}": replace(by_table, braking=np.zeros(0))}
     laws |= {f"{model}, {SOFT_END}": with_coil_model(soft, model, cells) for model in MODELS}
-    cases, cut = fly_all(_jumps_of(plant, laws, scenario), progress, options)
+    cases, cut = fly_all(jumps_of(plant, laws, scenario), progress, options)
     merits = tuple(
         Merit(f"rate of approach in {name}", value, "1/s") for name, value in zip("yz", rates, strict=True)
     )
     return Experiment("jump", "Who settles when the reference jumps?", cases, merits, interrupted=cut)
 
 
-def soft_jumps(plant: Plant, controller: Controller, *, rate: float = 0.0, **options: Any) -> Experiment:
-    """The jumps of `jump` with soft gains alone, by the analytical model and by the table; what `jump` says holds."""
-    reference = partial(jumps_reference, place=PLACE, gap=GAP, lift=LIFT, distance=DISTANCE)
-    scenario = scenario_of("jump", DURATION, reference, FORCES | options)
-    soft = soften(controller, plant, (rate, rate) if rate else braking_rates(plant, DISTANCE, LIFT))
-    laws = {f"{model}, {SOFT_END}": with_coil_model(soft, model) for model in ("analytical", "table")}
-    cases, cut = fly_all(_jumps_of(plant, laws, scenario), None, options)
-    return Experiment("jump", "What do the coil models leave of jumps?", cases, (), interrupted=cut)
-
-
-def _jumps_of(
+def jumps_of(
     plant: Plant, laws: Mapping[str, Controller], scenario: Scenario
 ) -> list[tuple[Plant, Controller, PlannedRun]]:
     """The jumps with laws by their labels."""

@@ -21,18 +21,20 @@ class Parameters:
     r_c: float = si("m", at_least=0, shapes=True)  # inner corner radius of a coil
     N_c: float = si("1", above=0)  # turns
     h_m: float = si("m", above=0, shapes=True)  # thickness of the magnets
-    B_r: float = si("T", above=0)  # their remanence, relative permeability 1
+    B_r: float = si("remanence [T]", above=0)  # their remanence, relative permeability 1
     upright: float = si("1", above=0, shapes=True)  # upright blocks' width over sqrt(2) tau_n
     h: float = si("m", above=0)  # air gap: the working height
-    B_z: float = si("T", above=0)  # flux density that (17)-(24) count with, at the working height
+    B_z: float = si(
+        "flux density [T]", above=0
+    )  # flux density that (17)-(24) count with, at the working height
     C: float = si("1", above=0)  # harmonic compensation factor of (23), (24)
     coil_pitch: float = si("m", above=0)  # of the 4 x 4 coils
-    r_z: float = si("m")  # centre of gravity to the coils' centre of force
+    r_z: float = si("height of the force [m]")  # centre of gravity to the coils' centre of force
     w_m: float = si("m", above=0)  # width of the mover's square plate
-    m: float = si("kg", above=0)  # mover with coils
-    I_x: float = si("kg m^2", above=0)
-    I_y: float = si("kg m^2", above=0, twin="I_x")
-    I_z: float = si("kg m^2", above=0)
+    m: float = si("mass [kg]", above=0)  # mover with coils
+    I_x: float = si("moment of inertia [kg m^2]", above=0)
+    I_y: float = si("moment of inertia [kg m^2]", above=0, twin="I_x")
+    I_z: float = si("moment of inertia [kg m^2]", above=0)
     g: float = si("m/s^2", at_least=0)
     F_max: float = si("N", above=0)  # limit of each commanded force
     T_max: float = si("N m", above=0)  # limit of each commanded torque

@@ -7,16 +7,9 @@ from collections.abc import Callable
 from itertools import cycle
 from typing import TYPE_CHECKING
 
-import casadi as ca
 import numpy as np
 
-from malta.machines.tubular.experiment_figures import (
-    capture_figure,
-    carrier_figure,
-    commissioning_figure,
-    recording_figure,
-    supervised_faults_figure,
-)
+from malta.machines.tubular.experiment_figures import commissioning_figure, supervised_faults_figure
 from malta.machines.tubular.experiments.disturbances import REST_SAMPLES
 from malta.model.plants import plant_of
 from malta.report.figures.drawing import (
@@ -60,7 +53,6 @@ from malta.simulation.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from malta.model.plant import Plant
     from malta.simulation.experiments import Experiment, Merit
 
 
@@ -70,9 +62,10 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     motion = run.scenario.reference(plant)
     first, last = motion(np.array([0, run.scenario.duration])).p[:, axis]
     errors = (
-        f"axial error {f.axial_error * 1e3:.2f} mm, radial deviation {max(f.radial.values()) * 1e6:.1f} µm"
+        f"axial error {f.axial_error * 1e3:.2f} mm, "
+        f"radial deviation {number(max(f.radial.values()) * 1e6, 2)} µm"
     )
-    tracked = f"rise {number(f.rise * 1e3, 3)} ms, overshoot {f.overshoot * 100:.1f} %, "
+    tracked = f"rise {number(f.rise * 1e3, 3)} ms, overshoot {number(f.overshoot * 100, 2)} %, "
     figure = new_page(
         [run],
         f"stroke of {(last - first) * 1e3:.3g} mm{ending_text(run)}",
@@ -277,29 +270,6 @@ def _half_way(run: Trajectory) -> float:
     return float(t[np.abs(run.scenario.reference(run.plant)(t).dp[:, run.plant.stroke_output]).argmax()])
 
 
-def thermal_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """The drift of the support, and the mover's position in space with and without the outer loop. Fig. 15."""
-    _, now, true = (merit.phrase() for merit in e.merits)
-    found = f"{merits_phrase(e.cases, 0)}; lag {now}, at true speed {true}"
-    figure = new_page(runs_of(e), "support drifts by thermal expansion", found, hspace=0.18)
-    space, blow_up = figure.subplots(2, 1, sharex=True)
-    t, drift = e.run.t, e.curves["drift"]
-    draw_line(space, t, drift * 1e6, label="drift of the support", color="#cfcfcf", linewidth=6)
-    for case, style in zip(e.cases, STYLES, strict=False):
-        size = min(len(t), len(case.run.t))
-        place = (case.run.p[:size, 2] + drift[:size]) * 1e6
-        draw_line(space, t[:size], place, label=f"mover in space, {case.label}", **style)
-        mark_end(space, case.run, t[:size], place)
-        if case is e.cases[0]:
-            draw_line(blow_up, t, place, **style | {"linewidth": 0.8})
-    read = ("figure_14.resolution", "um", "published resolution of the sensors")
-    draw_published(blow_up, published, *read, both=True, where="under right")
-    finish_axes(space, "", "x2 in space [µm]")
-    finish_axes(blow_up, "simulated time [s]", f"{e.cases[0].label}, enlarged [µm]")
-    add_shared_legend(figure)
-    return figure
-
-
 def disturbance_figure(e: Experiment, _: Published | None = None) -> Figure:
     """Compliance over frequency with simulated points, and the responses to steps and to vibration."""
     plant, c = e.run.plant, e.curves
@@ -376,48 +346,6 @@ def _touchdown_text(after: Merit) -> str:
     return f"touchdown after {after.phrase()}" if after.value >= 0 else "touchdown before it"
 
 
-def drive_limits_figure(e: Experiment, _: Published | None = None) -> Figure:
-    """Position, speed, current and voltage of the fastest stroke and of the sigmoid, against the limits."""
-    plant, actuator = e.run.plant, e.run.plant.actuator
-    what = "fastest stroke, and sigmoid of the same peak current"
-    what += "".join(f", {case.label}{ending_text(case.run)}" for case in e.cases if ending_text(case.run))
-    figure = new_page(runs_of(e), what, merits_phrase(e.cases, 1), hspace=0.2)
-    (position, current), (speed, voltage) = figure.subplots(2, 2, sharex=True)
-    half = 0.75e3 * e.cases[-1].merits[1].value
-    position.set_xlim(-half, half)
-    thrust, rate = _thrust_axis(plant), len(plant.states) // 2 + plant.stroke_state
-    for case, style in zip(e.cases, STYLES, strict=False):
-        run, ms = case.run, (case.run.t - case.run.scenario.duration / 2) * 1e3
-        draw_line(position, ms, run.p[:, plant.stroke_output] * 1e3, label=case.label, **style)
-        mark_end(position, run, ms, run.p[:, plant.stroke_output] * 1e3)
-        draw_line(speed, ms, run.x[:, rate], **style)
-        draw_line(current, ms, run.axis_currents[:, thrust], **style)
-        if run.u.size:
-            draw_line(voltage, ms, run.u[:, thrust], **style)
-    if not e.run.u.size:
-        note = f"none at fidelity {e.run.scenario.fidelity}"
-        voltage.annotate(note, (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
-    for axes, merit, limit in (
-        (current, e.merits[0], actuator.current_limit),
-        (voltage, e.merits[1], actuator.voltage_limit),
-    ):
-        draw_bound(axes, merit.value, "for the reference", both=True, where="below left")
-        draw_bound(axes, limit, "limit of the drive", both=True, where="above left")
-    finish_axes(position, "", "position z [mm]")
-    finish_axes(current, "", "current per module [A]")
-    finish_axes(speed, "time from half-way [ms]", "speed [m/s]")
-    finish_axes(voltage, "time from half-way [ms]", "voltage per module [V]")
-    add_shared_legend(figure)
-    return figure
-
-
-def _thrust_axis(plant: Plant) -> int:
-    """The first axis with a thrust current."""
-    unit = np.zeros(len(plant.inputs))
-    unit[plant.thrust_input] = 1.0
-    return int(np.flatnonzero(np.array(ca.DM(plant.drive.command(ca.DM(unit)))))[0])
-
-
 def _published_stroke(e: Experiment, published: Published | None) -> Figure:
     """`stroke_figure`, with published bounds only for the published stroke."""
     return stroke_figure(e.run, published if any(merit.published for merit in e.merits) else None)
@@ -429,13 +357,8 @@ FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
     "tilt": tilt_figure,
     "lift-off": lift_off_figure,
     "payload": payload_figure,
-    "thermal": thermal_figure,
     "disturbance": disturbance_figure,
     "faults": faults_figure,
-    "drive-limits": drive_limits_figure,
-    "record-v0": recording_figure,
-    "carrier": carrier_figure,
-    "capture": capture_figure,
     "commissioning": commissioning_figure,
     "supervised-faults": supervised_faults_figure,
 }

@@ -11,21 +11,21 @@ from malta.model.parameters import check_parameters, si
 class Parameters:
     """Physical parameters, SI. data/tubular.toml has the source of each."""
 
-    m: float = si("kg", above=0)  # mover with magnets
-    I_xx: float = si("kg m^2", above=0)  # moments of inertia in frame R
-    I_yy: float = si("kg m^2", above=0, twin="I_xx")
-    I_zz: float = si("kg m^2", above=0)
-    K_A: float = si("N/m", at_least=0)  # attraction per module (a negative stiffness)
-    K_B: float = si("N/A", above=0)  # bearing force per module
-    K_D: float = si("N/A", above=0)  # drive force per module
-    l_B: float = si("m", above=0)  # origin to bearing plane
+    m: float = si("mass [kg]", above=0)  # mover with magnets
+    I_xx: float = si("moment of inertia [kg m^2]", above=0)  # moments of inertia in frame R
+    I_yy: float = si("moment of inertia [kg m^2]", above=0, twin="I_xx")
+    I_zz: float = si("moment of inertia [kg m^2]", above=0)
+    K_A: float = si("magnet stiffness [N/m]", at_least=0)  # attraction per module (a negative stiffness)
+    K_B: float = si("force constant [N/A]", above=0)  # bearing force per module
+    K_D: float = si("thrust constant [N/A]", above=0)  # drive force per module
+    l_B: float = si("bearing distance [m]", above=0)  # origin to bearing plane
     l_S: float = si("m", above=0)  # origin to sensor plane
     L_p: float = si("m", above=0)  # pole size
     g: float = si("m/s^2", at_least=0)
-    F_c: float = si("N", at_least=0)  # cogging amplitude
+    F_c: float = si("cogging [N]", at_least=0)  # cogging amplitude
     phi_c: float = si("rad")  # cogging phase
-    R: float = si("ohm", above=0)  # phase winding
-    L: float = si("H", above=0)
+    R: float = si("resistance [ohm]", above=0)  # phase winding
+    L: float = si("inductance [H]", above=0)
     Psi: float = si("Wb", above=0)  # flux linkage
     K_ind: float = si("V s/m", above=0)  # induced voltage
     V_dc: float = si("V", above=0)  # DC link

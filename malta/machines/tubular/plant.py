@@ -232,21 +232,26 @@ def contact(par: Parameters, x: Any, trig: Trig = EXACT_TRIG) -> Any:
 def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT_TRIG) -> Any:
     """Wrench of the touchdown bearings in the sensor planes: k_t delta + d_t delta', never pulling, without friction.
 
-    delta is how far the mover's axis is beyond the clearance r_max at the plane. `x` is a CasADi SX symbol.
+    delta is how far the mover's axis is beyond the clearance r_max at the plane. The axial end stops push alike where
+    the stroke is beyond z_max; a simulation ends there, a co-simulation goes on. `x` is a CasADi SX symbol.
     """
     rates = ca.vertcat(x[6:12], ca.SX.zeros(6))
     p = measure_outputs(par, x, trig)
     dp = ca.jtimes(p, x, rates)
     force, torque = ca.SX.zeros(3), ca.SX.zeros(3)
+
+    def push_of(delta: Any, outwards: Any) -> Any:
+        return ca.if_else(delta > 0, ca.fmax(par.k_t * delta + par.d_t * outwards, 0), 0)
+
     middle = x[0:3] + centre_of_gravity(par, x[3:6], trig)
     for i, plane in ((0, -par.l_S), (2, par.l_S)):
         r, dr = p[i : i + 2], dp[i : i + 2]
         size = ca.sqrt(ca.sumsqr(r) + 1e-24)
-        delta, outwards = size - par.r_max, ca.dot(r, dr) / size
-        push = ca.if_else(delta > 0, ca.fmax(par.k_t * delta + par.d_t * outwards, 0), 0)
+        push = push_of(size - par.r_max, ca.dot(r, dr) / size)
         F = ca.vertcat(-push * r / size, 0)
         force += F
         torque += ca.cross(ca.vertcat(r, plane) - middle, F)
+    force[2] -= ca.sign(p[4]) * push_of(ca.fabs(p[4]) - par.z_max, ca.sign(p[4]) * dp[4])
     return ca.vertcat(force, torque)
 
 

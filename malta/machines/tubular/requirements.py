@@ -135,6 +135,7 @@ REQUIREMENTS = (
         laws=ANY_LAW,
         flown=True,
         meaning="axial error in the stroke with 5 % error of K_D, either way",
+        error_of=("z",),
     ),
     Requirement(
         "radial_deviation",
@@ -143,6 +144,7 @@ REQUIREMENTS = (
         laws=ANY_LAW,
         flown=True,
         meaning="radial deviation in the same strokes",
+        error_of=("x1", "y1", "x2", "y2"),
     ),
     Requirement(
         "tilt_deviation",

@@ -173,6 +173,8 @@ class Dynamic:
     kind : "multiplicative" (a gain 1 + Delta), "feedback" (1 / (1 - Delta)) or "additive" (P + Delta)
     at : "sensors" or "forces", where a multiplicative or feedback block acts
     channel : counted from 0; several of them, as a tuple, share one full block; of an additive block (sensors, forces)
+    shares : of a multiplicative or feedback block, the share of W by which each of its channels may deviate, above 0:
+        Delta = diag(shares) Delta', |Delta'| <= |W|; (): all of it
 
     >>> import control, malta
     >>> W = control.tf([1 / 500, 0.1], [1 / 5000, 1])  # 10 %, from 50 rad/s on more
@@ -186,11 +188,13 @@ class Dynamic:
     kind: Literal["multiplicative", "feedback", "additive"] = "multiplicative"
     at: At = "sensors"
     channel: Channels | tuple[Channels, Channels] = 0
+    shares: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A block of a proof: w enters at `rows`, z is read at `columns`; unit: size of the probes of its entries."""
+    """A block of a proof: w enters at `rows`, z is read at `columns`; unit: size of the probes of its entries; shares:
+    by which each entry of w enters, (): 1."""
 
     kind: Literal["multiplicative", "feedback", "additive", "compliance", "effort"]
     at: At
@@ -198,6 +202,12 @@ class Block:
     columns: tuple[int, ...]
     weight: Weight
     unit: float = 0.5
+    shares: tuple[float, ...] = ()
+
+    @property
+    def entering(self) -> FloatArray:
+        """By how much each entry of w enters."""
+        return np.array(self.shares) if self.shares else np.ones(len(self.rows))
 
     @property
     def full(self) -> bool:
@@ -243,7 +253,14 @@ def _block_of(system: UncertainSystem, dynamic: Dynamic, where: str) -> Block:
         raise InputError(where, "kind, at", f"{dynamic.kind}, {dynamic.at}", expected)
     count = shape_of(system)[_NAMES.index(dynamic.at)]
     channels = channels_of(dynamic.channel, count, dynamic.at, where)
-    return Block(dynamic.kind, dynamic.at, channels, channels, weight)
+    shares = tuple(float(share) for share in dynamic.shares)
+    if shares and not (len(shares) == len(channels) and all(0 < share < math.inf for share in shares)):
+        raise InputError(
+            where, "shares", repr(dynamic.shares), f"{len(channels)} numbers above 0, of the channels"
+        )
+    if len(shares) == 1:
+        weight, shares = replace(weight, num=shares[0] * weight.num), ()
+    return Block(dynamic.kind, dynamic.at, channels, channels, weight, shares=shares)
 
 
 _NAMES = ("sensors", "forces")
@@ -370,7 +387,7 @@ def _add(matrix: ca.SX, b: Block, delta: ca.SX) -> ca.SX:
     """Add a block's entries to a matrix at its rows and columns."""
     found = ca.SX(matrix)
     for i, j in b.entries:
-        found[b.rows[i], b.columns[j]] += delta[i, j]
+        found[b.rows[i], b.columns[j]] += float(b.entering[i]) * delta[i, j]
     return found
 
 

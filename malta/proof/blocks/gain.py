@@ -53,11 +53,11 @@ from malta.proof.blocks.transfer import (
 from malta.proof.box import Box, box_of, within_branches
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
-from malta.proof.margin import Margin, Ranges, unproven
+from malta.proof.margin import NOT_BEGUN, Margin, Ranges, unproven
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven
 from malta.proof.problem import OfLoop, is_nominal_stable
 from malta.proof.robust import law_of, problem_of
-from malta.work import WorkUp, is_past, work_limit
+from malta.work import WorkUp, answer_in_time, is_past, work_limit
 
 # Unmodelled dynamics beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
 #
@@ -75,6 +75,7 @@ SEARCH = 0.4  # share of the work for the search of a loss; the rest is for the 
 
 
 @on_one_thread
+@answer_in_time(NOT_BEGUN)
 def dynamic_margin(
     system: UncertainSystem,
     compensator: Compensator | Any,
@@ -428,6 +429,7 @@ class Gain:
 
 
 @on_one_thread
+@answer_in_time(Gain(0.0, None, math.nan, {}, 0, 0.0, NOT_BEGUN.reason))
 def worst_case_gain(
     system: UncertainSystem,
     compensator: Compensator | Any,

@@ -28,7 +28,7 @@ from flint import acb, arb
 from malta.proof.blocks import Block, Expanded
 from malta.proof.box import Box
 from malta.proof.exclusion import PATCHES, CellBounds, Growth, advance, cut, growth_over, on_boxes, start
-from malta.proof.polynomial.enclosure import Polynomial, family_over
+from malta.proof.polynomial.enclosure import ROUGH_TAILS, Polynomial, family_over
 from malta.proof.polynomial.family import Family, align, combine
 from malta.work import is_past
 
@@ -127,7 +127,7 @@ def _part(
             for _, b, pins in acting:
                 for i in pins:
                     fixed[i - len(sides)] = -b.unit if i in at else 0.0
-            made = family_over(f, np.vstack([sides, fixed]), () if at else moves)
+            made = family_over(f, np.vstack([sides, fixed]), () if at else moves, ROUGH_TAILS)
             known[at] = replace(made, shape=made.shape[: len(sides)])  # entries are pinned
         return known[at]
 

@@ -71,9 +71,9 @@ def transfer(signals: LoopSignals, blocks: Sequence[Block]) -> ComplexArray:
         own, rows, columns = slice(k, k + len(b.rows)), list(b.rows), list(b.columns)
         k += len(rows)
         first = q + m if b.kind == "compliance" else q if b.kind in _LOOPS and b.at == "forces" else 0
-        into[[first + i for i in rows], own] = np.eye(len(rows))
+        into[[first + i for i in rows], own] = np.diag(b.entering)
         if b.kind == "feedback":  # it reads its own addition
-            passed[first][rows, own] += np.eye(len(rows))
+            passed[first][rows, own] += np.diag(b.entering)
         reads_u = b.kind in ("additive", "effort") or (b.kind in _LOOPS and b.at == "forces")
         signal = signals.u if reads_u else signals.y
         if b.kind == "additive":
@@ -81,7 +81,7 @@ def transfer(signals: LoopSignals, blocks: Sequence[Block]) -> ComplexArray:
         beside = passed[first][columns].copy() if b.kind in _LOOPS else 0.0
         found.append((signal[:, columns], beside))
         if b.kind in ("multiplicative", "additive"):
-            passed[first][rows, own] += np.eye(len(rows))
+            passed[first][rows, own] += np.diag(b.entering)
     return np.concatenate([z @ into + d for z, d in found], axis=1)
 
 

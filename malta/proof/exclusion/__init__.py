@@ -336,10 +336,12 @@ def on_boxes(
     f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None
 ) -> FrequencyExpansion:
     """The expansion of each cell with its coefficients over the cell's own box."""
-    unique, index = np.unique(cells, axis=0, return_inverse=True)
+    # An interval and its branch as one number: ends are not negative.
+    ends = (cells[:, 1] + 1j * cells[:, 2]) * (1 - 2 * cells[:, 0])
+    _, first, index = np.unique(ends, return_index=True, return_inverse=True)
     with np.errstate(over="ignore", invalid="ignore"):
-        e: FrequencyExpansion = expand(f, unique, like)
-        index, count = index.ravel(), len(e.terms)
+        e: FrequencyExpansion = expand(f, cells[first], like)
+        count = len(e.terms)
         together = np.stack(e.terms, axis=1)[index].reshape(len(index), -1)  # one more axis, which is not cut
         whole = np.concatenate([np.broadcast_to([0.0, 1.0], (len(index), 1, 2)), boxes], axis=1)
         cut = restrict(together, (count, *f.shape), whole).reshape(len(index), count, -1)

@@ -26,7 +26,17 @@ from malta.linear.expressions import NotAnalytic, exact
 from malta.proof.box import Box
 from malta.proof.exclusion import cut
 from malta.proof.polynomial.characteristic import pair
-from malta.proof.polynomial.enclosure import Disc, Polynomial, TooWide, Unproven, discs_of, ends_of, precision
+from malta.proof.polynomial.enclosure import (
+    Disc,
+    Polynomial,
+    TooWide,
+    Unproven,
+    discs_of,
+    ends_of,
+    precision,
+    remainder,
+    wanted_degree,
+)
 from malta.proof.polynomial.family import nodes, scale_of
 from malta.proof.problem import Problem, hurwitz
 from malta.work import check_clock, spend
@@ -36,7 +46,7 @@ MAX_POLYNOMIAL_DEGREE = 14  # degree in s
 DETERMINANT, HALVING = 3e-7, 4e-6  # work of a determinant, by its order cubed; of a cell, by its coefficients
 MOST_PLACES = 4000  # at which a_k, or H, is evaluated
 MAX_INTERPOLATION_DEGREE = 40  # degree of an interpolation along one parameter
-TAIL = -70.0  # log2 of what an interpolation may leave out, relative to each coefficient
+TAIL = 2.0**-70  # what an interpolation may leave out, relative to each coefficient
 
 
 class Tensor(NamedTuple):
@@ -222,18 +232,13 @@ def _enclose(f: Polynomial, axes: BoxAxes) -> tuple[list[Tensor], list[Any]]:
 def _interpolation_nodes(name: str, axis: int, discs: list[Disc]) -> tuple[int, list[Any]]:
     """The lowest degree of an interpolation at Chebyshev nodes that leaves out little enough, and what it leaves out.
 
-    Lebesgue's constant is below 4. Raises TooWide when the degree is too high.
+    Raises TooWide when the degree is too high.
     """
-    best = MAX_INTERPOLATION_DEGREE + 1, discs[0]
-    for disc in discs:
-        rest = disc.share + 3 - math.log2(disc.radius - 1) - TAIL
-        best = min(best, (max(1, math.ceil(rest / math.log2(disc.radius))), disc), key=lambda pair: pair[0])
-    degree, disc = best
+    disc = min(discs, key=lambda disc: wanted_degree(disc, TAIL))
+    degree = max(1, math.ceil(wanted_degree(disc, TAIL)))
     if degree > MAX_INTERPOLATION_DEGREE:
         raise TooWide(axis, f"{name}: its range is too wide for one expansion")
-    radius = arb(disc.radius)
-    scale = 5 / (radius**degree * (radius - 1))
-    return degree, [arb(m) * arb(2) ** e * scale for m, e in disc.most]
+    return degree, [arb(m) * arb(2) ** e for m, e in remainder(disc, degree)]
 
 
 def _powers_at(grid: list[Any], degree: int) -> Any:

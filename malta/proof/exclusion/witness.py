@@ -143,6 +143,8 @@ def _corners(f: Family, g: Growth) -> list[tuple[float, int, float, FloatArray]]
         else rng.integers(0, 2, (64, len(free))).astype(float)
     )
     centre, grows = g.shares(g.nominal), g.grows
+    if grows[free].sum() == 1:  # its ends in the middle of all others as well
+        signs = np.vstack([signs, np.where(grows[free], [[0.0], [1.0]], centre[free])])
     found = []
     for row in signs:
         if is_past(price=(HALVINGS + 2) * (ROOTS + VALUE * f.values.size)):

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, finite
+from malta.linear.balls import BALLS, POINTS, finite
+from malta.linear.expressions import EXACT_ARITHMETIC, MatrixProgram, NotAnalytic
 from malta.linear.rational import Ratio, Symbolic, over_common_denominator, value
 from malta.linear.sampling import split_delay
 from malta.linear.uncertain import StateGroup
@@ -277,7 +278,7 @@ class Characteristic:
 
         def plant() -> Any:
             made = remembered(minors.resolvents, (A, E), resolvent)
-            return minors.plant(made, self._entries(p, (C,)), matrix)
+            return minors.plant(made, remembered(minors.known, (C,), lambda: self._entries(p, (C,))), matrix)
 
         pi = remembered(minors.known, (A, C, E), plant)
         return pi, remembered(minors.known, (B, E), lambda: minors.forces(self._entries(p, (B, E)), matrix))
@@ -427,11 +428,7 @@ class Characteristic:
 def map_bounds(product: list[Any]) -> list[Any]:
     """Bounds of the coefficients of v from those of g."""
     n = len(product) - 1
-    turned = [arb(0)] * (n + 1)
-    for k, c in enumerate(product):
-        for j in range(n - k + 1):
-            turned[k + j] += c * (2**k * math.comb(n - k, j))
-    return turned
+    return list((_absolute_bilinear(n, ctx.prec) * arb_mat(n + 1, 1, product)).entries())
 
 
 def _ends_of(x: Any) -> tuple[Any, ...]:
@@ -494,3 +491,8 @@ def map_bilinear(a: list[Any]) -> list[Any]:
 def _bilinear_balls(n: int, bits: int) -> Any:
     del bits  # of the current precision
     return arb_mat(_bilinear(n))
+
+
+@lru_cache(maxsize=64)
+def _absolute_bilinear(n: int, bits: int) -> Any:
+    return arb_mat(n + 1, n + 1, [abs(x) for x in _bilinear_balls(n, bits).entries()])

@@ -1,8 +1,9 @@
 """A characteristic polynomial enclosed over a box of parameters: an interpolation and a bound of its error.
 
-With |a_k| <= M on the disc of radius R about the middle of a side (of half width 1), interpolation of degree d at
-Chebyshev nodes has an error of at most (1 + Lambda_d) M R^-d / (R - 1): Cauchy's estimate with the Lebesgue constant
-Lambda_d.
+With |a_k| <= M on the disc of radius R about the middle of a side (of half width 1), interpolation at the n zeros of
+Chebyshev's polynomial T_n leaves out the integral of T_n(x) a(z) / (T_n(z) (z - x)) over the circle, over 2 pi j
+(Hermite). There |T_n(x)| <= 1, and |T_n(z)| >= sinh(n arcosh R) as |cosh(n (a + jb))| >= sinh(n a) and
+cosh^2 a = R^2 + sin^2 b, so that the error is at most M R / (R - 1) / sinh(n arcosh R).
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ from malta.work import check_clock, remember, spend
 MOST_NODES = 20_000  # places of exact coefficients, at most
 MOST_BALLS = 10_000  # places where they take an exponential: one family of all is cheaper than its halves
 FEW_PLACES_LIMIT = 1500  # places beyond which more may be left out
-TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
+TAILS = (2e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
+ROUGH_TAILS = 1e-6, 3e-6  # where a thousandth of a bound is enough
 MAX_TAIL = 1e-5  # beyond which the box is cut
 MAX_DEGREE = 16  # degree of an interpolation along one parameter
-LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
+ROUNDED_NODES = 1 + 1e-9  # factor of bounds for nodes that lie 2e-15 beside the zeros, see `remainder`
 RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 25, 32, 40))
 FIRST_RADIUS = RADII.index(2.0**12)  # where the search of discs begins
 FIRST_IMPLICIT_RADIUS = RADII.index(2.0**1.5)  # of roots of equations, which are not enclosed far from a box
@@ -95,7 +97,9 @@ class Side:
     tails: tuple[tuple[float, int], ...] | None
 
 
-def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = ()) -> Family:
+def over_box(
+    f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), tails: Sequence[float] = TAILS
+) -> Family:
     """The family over a box (P x 2, of p); moves: bounds of the effect of neglected couplings (closed_loop.py).
 
     Raises TooWide when a narrower box may have an enclosure, else Unproven; WorkUp within a work_limit.
@@ -105,7 +109,7 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = ()) -> Fam
     low, high = ends_of(f, sides)
     with precision(BITS):
         known = f.degrees
-        plan = _plan(f, low, high, known)
+        plan = _plan(f, low, high, known, tails)
         count = math.prod(side.degree + 1 for side in plan)
         if count > (MOST_NODES if f.exact else MOST_BALLS):
             axis = max(range(len(plan)), key=lambda i: plan[i].degree)
@@ -118,19 +122,21 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = ()) -> Fam
     ]
     points = values_within(f, list(itertools.product(*grid)))
     ends = [(arb(a), arb(b)) for a, b in sides.tolist()]
-    tails = add_bounds(_sum_tails(plan), f.coupling_bounds(moves, ends))
-    return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
+    left = add_bounds(sum_tails(plan), f.coupling_bounds(moves, ends))
+    return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, left)
 
 
 FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, tuple[Family, Sequence[float]]]] = WeakKeyDictionary()
 MAX_KEPT_NUMBERS = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 
 
-def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...]) -> Family:
+def family_over(
+    f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], tails: tuple[float, ...] = TAILS
+) -> Family:
     """The family of a polynomial over `sides`, remembered: several margins need it over the same box."""
     known = FAMILIES.setdefault(f, {})
-    key = (sides.tobytes(), tuple(pair(m) for m in moves))
-    found = remember(known, key, lambda: over_box(f, sides, moves))
+    key = (sides.tobytes(), tuple(pair(m) for m in moves), tails)
+    found = remember(known, key, lambda: over_box(f, sides, moves, tails))
     while len(known) > 1 and sum(other.values.size for other, _ in known.values()) > MAX_KEPT_NUMBERS:
         known.pop(next(iter(known)))
     return found
@@ -191,7 +197,9 @@ def _is_accurate(c: Any) -> bool:
     return bool(c.rel_accuracy_bits() >= 66) if hasattr(c, "rel_accuracy_bits") else True
 
 
-def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | None, ...]) -> list[Side]:
+def _plan(
+    f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | None, ...], tails: Sequence[float]
+) -> list[Side]:
     """The sampling of each side; the error is smaller when that needs few places."""
     free = [i for i, d in enumerate(known) if d is None and low[i] < high[i]]
     discs: dict[int, list[Disc]] = {}
@@ -201,7 +209,7 @@ def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | Non
         size = [pair(c if hasattr(c, "abs_upper") else arb(c)) for c in nominal]
         discs = {i: discs_of(f, i, low, high, size) for i in free}
     plan: list[Side] = []
-    for tail in TAILS:
+    for tail in tails:
         plan = [
             interpolation_side(f.names[i], i, discs[i], tail) if i in discs
             else Side(0 if low[i] == high[i] else d or 0, False, None)
@@ -234,8 +242,8 @@ def discs_of(
     refused = NotAnalytic("no disc about its range")
     first = FIRST_IMPLICIT_RADIUS if f.implicit else FIRST_RADIUS
     for radii in (RADII[first:], RADII[:first][::-1]):
-        least = min((_wanted_degree(disc, TAILS[0]) for disc in found), default=math.inf)
-        if len(found) > 1 and least < _wanted_degree(found[0], TAILS[0]):
+        least = min((wanted_degree(disc, TAILS[0]) for disc in found), default=math.inf)
+        if least <= 1 or (len(found) > 1 and least < wanted_degree(found[0], TAILS[0])):
             break  # larger discs are the better ones
         for radius in radii:
             spend(DISC * f.price)
@@ -247,8 +255,8 @@ def discs_of(
                     break
                 continue
             found.append(disc)
-            wanted = _wanted_degree(disc, TAILS[0])
-            if wanted > least:
+            wanted = wanted_degree(disc, TAILS[0])
+            if wanted > least or wanted <= 1:
                 break
             least = wanted
     if not found:
@@ -273,50 +281,55 @@ def _disc(
     return Disc(radius, share, most)
 
 
-def _wanted_degree(disc: Disc, tail: float) -> float:
-    """The degree at which the bound of a disc leaves an error of `tail`."""
-    return (disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius)
+def remainder(disc: Disc, degree: int) -> list[tuple[float, int]]:
+    """Bounds of what an interpolation of a degree leaves out, by the bounds on a disc: (mantissa, exponent).
+
+    Nodes x_j that lie e beside the zeros multiply T_n(x) by at most exp(n^3 e) on the side: without k of its factors
+    T_n is a divided difference, at most T_n^(k)(1) / k! < n^2k, and on the circle T_n loses n e / (R - 1) of itself.
+    """
+    radius, _, most = disc
+    angle = min((degree + 1) * math.acosh(radius), 700.0)  # whose sinh does not overflow
+    scale = ROUNDED_NODES * radius / (radius - 1) / math.sinh(angle)
+    return [(m * scale, e) for m, e in most]
+
+
+def wanted_degree(disc: Disc, tail: float) -> float:
+    """The degree at which the bound of a disc leaves a relative error of `tail`; 2 sinh as an exponential."""
+    height = (disc.share + 1) * math.log(2) + math.log(disc.radius / (disc.radius - 1) / tail)
+    return height / math.acosh(disc.radius) - 1
 
 
 def interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
     """The sampling of the lowest degree with an error of at most `tail` by any disc; else the one of least error."""
-    best, best_rank = None, (True, 0, math.inf)
-    for disc in discs:
-        radius, share, most = disc
-        rest = share + 3 - math.log2(radius - 1)
-        degree = max(1, min(math.ceil(_wanted_degree(disc, tail)), MAX_DEGREE))
-        left = rest - degree * math.log2(radius)
-        enough = left <= math.log2(tail)
-        rank = (not enough, degree if enough else 0, left)
-        if best is None or rank < best_rank:
-            scale = LEBESGUE * radius**-degree / (radius - 1)
-            best = Side(degree, True, tuple((m * scale, e) for m, e in most))
-            best_rank = rank
-    assert best is not None
-    if best_rank[2] > math.log2(MAX_TAIL):
+
+    def rank(disc: Disc) -> tuple[bool, int, float]:
+        wanted = wanted_degree(disc, tail)
+        degree = max(1, min(math.ceil(wanted), MAX_DEGREE))
+        left = (wanted - degree) * math.acosh(disc.radius)  # ln of the error over the tail
+        return left > 0, degree, left
+
+    disc = min(discs, key=rank)
+    _, degree, left = rank(disc)
+    if left > math.log(MAX_TAIL / tail):
         raise TooWide(axis, f"{name}: its range is too wide for one expansion")
-    return best
+    return Side(degree, True, tuple(remainder(disc, degree)))
 
 
 def _log2(pair: tuple[float, int]) -> float:
     return math.log2(pair[0]) + pair[1] if pair[0] > 0 else -math.inf
 
 
-def _sum_tails(plan: list[Side]) -> list[tuple[float, int]] | None:
-    """The sum of the errors of all axes, each times the Lebesgue constants (below 3) of the axes before it."""
-    parts = [(side.tails, 3.0**k) for k, side in enumerate(s for s in plan if s.tails is not None)]
-    if not parts:
-        return None
-    total = []
-    for pairs in zip(*(tails for tails, _ in parts if tails is not None), strict=True):
-        top = max(e for _, e in pairs)
-        total.append(
-            (
-                sum(
-                    math.ldexp(m * growth, max(e - top, -1000))
-                    for (m, e), (_, growth) in zip(pairs, parts, strict=True)
-                ),
-                top,
-            )
-        )
+def lebesgue(degree: int) -> float:
+    """A bound of the Lebesgue constant at Chebyshev nodes: how much interpolation may enlarge a function."""
+    return (1 + 2 / math.pi * math.log(degree + 1)) * ROUNDED_NODES
+
+
+def sum_tails(plan: list[Side]) -> list[tuple[float, int]] | None:
+    """The sum of the errors of all axes, the largest first: each times the Lebesgue constants of those before it."""
+    parts = [(side.tails, side.degree) for side in plan if side.tails is not None]
+    parts.sort(key=lambda part: -max(map(_log2, part[0])))
+    total, growth = None, 1.0
+    for tails, degree in parts:
+        total = add_bounds(total, [(m * growth, e) for m, e in tails])
+        growth *= lebesgue(degree)
     return total

@@ -267,7 +267,7 @@ class Minors:
         """The factors of minors that are remembered."""
         return {}
 
-    @property
+    @cached_property
     def degree(self) -> int:
         law, (whole, part) = self.loop.law, split_delay(self.loop.law.delay)
         driven = len(self.rows) * ((law.lag is not None) + (part > 0))
@@ -317,28 +317,28 @@ class Minors:
 
     def majorant(self, sizes: Sizes) -> list[Any]:
         """Upper bounds of the coefficients of s or g."""
-        result: list[Any] = []
+        result = arb_poly()
         for (S, R), pi in sizes.pi.items():
-            weight = [] if R else self._absolute_kappa[(), ()]
+            weight = arb_poly() if R else self._absolute_kappa[(), ()]
             for T in itertools.combinations(range(len(self.inputs)), len(R)) if R else ():
                 if sizes.beta[R, T]:
-                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, S]])
-            if weight:
-                result = _sum(result, list((arb_poly(pi) * arb_poly(weight)).coeffs()) if pi else [])
-        return result
+                    weight += self._absolute_kappa[T, S] * arb(sizes.beta[R, T])
+            result += arb_poly(pi) * weight
+        found = list(result.coeffs())
+        return found + [arb(0)] * (self.degree + 1 - len(found))
 
     @cached_property
-    def _absolute_kappa(self) -> dict[Pair, list[Any]]:
-        return {pair: [arb(abs(x)) for x in p.coeffs()] for pair, p in self.balls[0].items()}
+    def _absolute_kappa(self) -> dict[Pair, Any]:
+        return {pair: arb_poly([abs(x) for x in p.coeffs()]) for pair, p in self.balls[0].items()}
 
-    @property
+    @cached_property
     def known(self) -> dict[Any, Any]:
         """The remembered minors of the system at places and on discs, which do not depend on the compensator."""
         return _kept_minors(
             self.loop.program, self._kind, self.group.states, self.rows, self.inputs, self.outputs
         )
 
-    @property
+    @cached_property
     def resolvents(self) -> dict[Any, Any]:
         """The remembered resolvents at places, those of images too."""
         return _kept_minors(self.loop.program, self._kind, self.image.of)
@@ -453,11 +453,8 @@ def _minors(resolvent: Resolvent, c: Any, order: int) -> dict[Pair, Any]:
 
 def _bounds(a: FloatArray, sides: list[tuple[FloatArray, FloatArray]]) -> list[list[Any]]:
     """Upper bounds of the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds of A and of each B and C."""
-    k = len(sides[0][1])
-    m = np.array([np.block([[a, b], [c, np.zeros((k, k))]]) for b, c in sides])
-    return all_bounds(m, np.where(np.arange(m.shape[1]) < len(a), 1.0, 0.0))
-
-
-def _sum(one: list[Any], two: list[Any]) -> list[Any]:
-    long, short = (one, two) if len(one) >= len(two) else (two, one)
-    return [x + short[k] if k < len(short) else x for k, x in enumerate(long)]
+    n, k = len(a), len(sides[0][1])
+    m = np.zeros((len(sides), n + k, n + k))
+    m[:, :n, :n] = a
+    m[:, :n, n:], m[:, n:, :n] = (np.array(part) for part in zip(*sides, strict=True))
+    return all_bounds(m, np.where(np.arange(n + k) < n, 1.0, 0.0))

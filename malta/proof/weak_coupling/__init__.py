@@ -46,7 +46,7 @@ GAIN_TOLERANCE = 1e-11  # gains of a compensator below this, relative, may be ro
 MAX_GROUP_AXES = 4  # axes of a group
 COEFFICIENT_LOOSENESS = 1e4  # how much larger bounds by coefficients are, about
 LIMIT = 0.3  # of the rows, where weights are chosen
-HALVINGS = 9
+PARTS = 256  # of a box, of which weights reach as many as they can
 SWEEP = 50  # frequencies at which weights are chosen
 FLOOR = 1e-6  # of what was seen, so that all weights are positive
 TERMS = 10  # of series in the stiffness
@@ -281,21 +281,18 @@ class HeldLoop:
 
         The proof is valid for any positive weights; the choice decides how far it reaches.
         """
-        low, high = 0.0, reach
         best, rho = self._perron(box.sides(0.0), math.inf)
         if rho >= LIMIT:
             return best
-        for _ in range(HALVINGS):
-            if is_past(price=PERRON):
-                break
-            t = (low + high) / 2 if high < reach or low else reach
-            found, rho = self._perron(box.sides(t), LIMIT)
+        low, high, step = 0, PARTS, 0  # of the box: from its end down in steps that double, then between two
+        while high - low > 1 and not is_past(price=PERRON):
+            k = (low + high) // 2 if low else max(PARTS - step, 1)
+            found, rho = self._perron(box.sides(reach * k / PARTS), LIMIT)
             if rho < LIMIT:
-                low, best = t, found
-                if t == reach:
-                    break
+                low, best = k, found
             else:
-                high = t if t < reach else reach * (1 - 1e-9)
+                high = k
+            step = max(1, 2 * step)
         return best
 
     def _perron(self, sides: FloatArray, most: float) -> tuple[FloatArray, float]:

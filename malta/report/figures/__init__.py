@@ -12,6 +12,7 @@ An experiment without a figure of its own is drawn by `run_figure`: its first ru
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -46,6 +47,7 @@ from malta.report.figures.drawing import (
     save as save,
     save_figure,
 )
+from malta.report.figures.log import log_figure as log_figure, strips_figure as strips_figure
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.experiments.catalogue import experiments_of
 from malta.simulation.trajectory import Trajectory
@@ -56,8 +58,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.arrays import FloatArray
-    from malta.identification.log import Log
+    from malta.identification.identified import Identified
     from malta.identification.measure import Curve, Measurement
+
+
+TOP_BELOW_LEGENDS = 0.835  # of panels whose legends have two rows
 
 
 def experiment_figure(
@@ -155,6 +160,9 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
         axes.tick_params(labelbottom=k >= last)
     for axes in grid[len(panels) :]:
         axes.set_visible(False)
+    legends = [axes.get_legend() for axes in grid[:columns]]
+    if any(one is not None and len(one.get_texts()) > 4 for one in legends):  # two rows of them
+        figure.subplots_adjust(top=TOP_BELOW_LEGENDS)
     return figure
 
 
@@ -175,6 +183,7 @@ def _draw_errors(axes: Axes, x: str, run: Trajectory, group: SignalGroup, unit: 
     error = in_unit(1.0, unit) * (run.p - run.reference)
     several = len(group.columns) > 1
     columns = draw_group(axes, run.t * 1e3, {run.plant.outputs[k].name: error[:, k] for k in group.columns})
+    axes.ticklabel_format(axis="y", scilimits=(-2, 5))  # numbers of many zeros have no room
     name = group.name if several else run.plant.outputs[group.columns[0]].name
     finish_axes(axes, x, f"{name}, off reference [{micro(unit)}]", legend=columns if several else 0)
 
@@ -207,45 +216,7 @@ def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
     finish_axes(axes, x, "currents, from least to largest [A]", legend=2)
 
 
-# Figures of a log, and of a loop that was measured.
-
-
-PANELS = {
-    "y": "measured",
-    "reference": "reference",
-    "v": "command",
-    "excitation": "excitation",
-    "i": "current",
-}
-INTERVALS = 2000  # of a line of a log, each drawn from its least to its largest value
-
-
-def log_figure(log: Log) -> Figure:
-    """Draw a log: measured outputs, reference, commands, excitation and currents over time."""
-    groups = [g for g in PANELS if log.names(g) and (g == "y" or np.nan_to_num(log.columns[g]).any())]
-    figure = new_figure(log.source, "; ".join(log.survey.findings), size=(9.0, 1.2 + 1.9 * len(groups)))
-    for axes, group in zip(
-        figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0], groups, strict=True
-    ):
-        micro = {"m": 1e6, "rad": 1e6}.get(log.signals[group][0].unit, 1.0)
-        for signal, values in zip(log.signals[group], log.columns[group].T, strict=True):
-            axes.plot(*_thin(log.t, micro * values), lw=0.8, label=signal.name)
-        unit = log.signals[group][0].unit
-        finish_axes(
-            axes, "time [s]", f"{PANELS[group]} [{'u' if micro != 1 else ''}{unit}]", legend=len(axes.lines)
-        )
-    return figure
-
-
-def _thin(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The least and the largest value of each of INTERVALS."""
-    each = len(t) // INTERVALS
-    if each < 4:
-        return t, values
-    whole = INTERVALS * each
-    parts = values[:whole].reshape(INTERVALS, each)
-    ends = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
-    return np.repeat(t[:whole:each], 2), ends
+# Figures of a loop that was measured.
 
 
 def measured_figure(found: Measurement) -> Figure:
@@ -269,6 +240,55 @@ def measured_figure(found: Measurement) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("frequency [Hz]", fontsize=8)
     panels[0, 0].legend(fontsize=7, frameon=False)
+    return figure
+
+
+def identified_figure(found: Identified) -> Figure:
+    """Draw an identification: responses measured and explained, what is left of each line, and S with its band."""
+    e, outputs = found.explanation, found.plant.outputs
+    if e is None:
+        raise InputError("identify", "--figure", "a log that nothing was explained of", "an identified one")
+    f, order = e.w / (2 * np.pi), np.argsort(e.w)
+    size = (11.0, 1.4 + 1.75 * len(outputs))
+    figure = new_figure(
+        f"{found.log.source}: {found.plant.name}",
+        textwrap.fill(found.refusal or found.verdict, 120),
+        size=size,
+        wspace=0.3,
+        top=1 - 1.05 / size[1],
+    )
+    panels = figure.subplots(len(outputs), 3, sharex=True, squeeze=False)
+    for k, (signal, row) in enumerate(zip(outputs, panels, strict=True)):
+        measured, left, noise = e.measured[:, k], np.abs(e.left[:, k]), e.noise[:, k]
+        row[0].plot(f, np.abs(measured), ".", color="#c1440e", markersize=4, label="measured")
+        row[0].plot(
+            f,
+            np.abs(measured - e.left[:, k]),
+            "o",
+            mfc="none",
+            color="#4a4a4a",
+            markersize=5,
+            label="explained",
+        )
+        row[1].fill_between(
+            f[order], 1e-2 * noise[order], 1.73 * noise[order], color="#d9d9d9", label="noise, 95 %"
+        )
+        row[1].plot(f, left, ".", color="#c1440e", markersize=4, label="left")
+        for axes, label in zip(row[:2], (f"{signal.name} / rms [1]", "left / rms [1]"), strict=True):
+            axes.set(xscale="log", yscale="log")
+            axes.set_ylabel(label, fontsize=8)
+            draw_grid(axes)
+        row[1].set_ylim(bottom=0.3 * float(noise.min()))
+        if found.loop is not None:
+            _draw_curve(row[2], found.loop.measured.w / (2 * np.pi), found.loop.measured.S.at(k))
+            row[2].set_ylabel(f"|S| of {signal.name} [1]", fontsize=8)
+        for axes in row:
+            axes.tick_params(which="both", labelsize=7)
+    for axes, last in zip(panels[0], panels[-1], strict=True):
+        axes.legend(
+            fontsize=7, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2
+        )
+        last.set_xlabel("frequency [Hz]", fontsize=8)
     return figure
 
 

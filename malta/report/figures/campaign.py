@@ -275,16 +275,16 @@ def _run_label(plan: Plan, index: int, verdict: float) -> str:
 
 
 END_STYLES: Mapping[str, dict[str, Any]] = {  # ways in which runs end, the best first; contacts follow
-    "within the published bounds": {"facecolor": "#ececec"},
-    "completed": {"facecolor": "#b4b4b4"},
-    "completed, commands limited": {"facecolor": "#b4b4b4", "hatch": "////"},
+    "within the published bounds": {"facecolor": "#2f7ea8"},
+    "completed": {"facecolor": "#e8dcc0"},
+    "completed, commands limited": {"facecolor": "#e8dcc0", "hatch": "////"},
     "diverged": {"facecolor": "#c1440e"},
     "not lifted": {"facecolor": "#d8d8d8", "hatch": ".."},
 }
 TOUCHES: Sequence[dict[str, Any]] = (
     {"facecolor": "#202020"},
-    {"facecolor": "#6a6a6a"},
-    {"facecolor": "#202020", "hatch": "xx"},
+    {"facecolor": "#ffffff", "edgecolor": "#202020", "hatch": "xx"},
+    {"facecolor": "#202020", "hatch": ".."},
 )
 BINS = 40  # of a distribution
 
@@ -462,6 +462,7 @@ def _draw_bands(axes: Axes, plan: Plan, name: str, counts: Any) -> None:
     total = counts.sum(axis=0)
     base = np.zeros(len(total))
     by_way = dict(zip(ways_to_end(plan), counts, strict=True))
+    bounded = by_way["within the published bounds"].any()
     for label, style in (dict(END_STYLES) | dict(zip(plan.plant.contacts.names, cycle(TOUCHES)))).items():
         if not by_way[label].any():
             continue
@@ -472,10 +473,8 @@ def _draw_bands(axes: Axes, plan: Plan, name: str, counts: Any) -> None:
             np.diff(edges),
             base,
             align="edge",
-            label=label,
-            edgecolor="#ffffff",
-            linewidth=0.6,
-            **style,
+            label="completed, outside the bounds" if label == "completed" and bounded else label,
+            **{"edgecolor": "#ffffff", "linewidth": 0.6, **style},
         )
         base += share
     finish_axes(axes, f"{name} [{'%' if unit == 'percent' else micro(unit)}]", "")

@@ -368,7 +368,9 @@ def front_figure(tuned: TuningResult, path: str | Path | None = None) -> Figure:
     taken = next((one for one in front if one.values == chosen.values), chosen)
     others = [one for one in front if one is not taken] or [taken]
     kept = (
-        "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
+        ("keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}")
+        if tuned.requirements
+        else "was not judged"
     )
     share = at_least(taken.figures["margin"]).percent()
     found = f"{tuned.trials} trials; open marks: taken, margin {share}, which {kept}; "

@@ -17,24 +17,27 @@ from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.windings import LAST_STAGE
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
 from malta.merit_lists import in_groups
-from malta.merits import Merit
+from malta.merits import Merit, figure
 from malta.model.linear.parameters import is_linear
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.model.plants import plant_of
 from malta.report.figures.drawing import micro, number
-from malta.simulation.experiments import Experiment, progress_of_part
+from malta.simulation.experiments import Experiment, progress_of_part, whole_experiment
 from malta.simulation.experiments.catalogue import experiment, main_job
 from malta.synthesis.spec import Pid, Spec, StructuredLaw, integral_signals, pid_signals, process_signals
 from malta.synthesis.weighting import Weights
 from malta.tuning.verify import verify, with_requirements
 from malta.units import FINE_UNITS, identifier, in_unit
+from malta.work import NO_TIME, WorkUp, is_stopped, share_time
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.loops.windings import CurrentLoops
+    from malta.margins.load_sizes import LoadLimit
     from malta.synthesis.controller import Controller
 
+MARGIN_SHARE = 0.6  # of the time, for the margins; the rest is for the flights
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
 
 
@@ -71,6 +74,7 @@ class Analysis:
     job: Experiment | None  # None where it could not be simulated
     campaigns: Sequence[Summary]
     notes: Sequence[str]  # what could not be computed, and why
+    loads: tuple[LoadLimit, ...] = ()  # of any waveform; none without a proof
 
     @property
     def plant(self) -> Plant:
@@ -85,7 +89,8 @@ class Analysis:
     @cached_property
     def figures(self) -> tuple[Merit, ...]:
         """The figures of merit of the loop and of the main job, in the order of their groups."""
-        return in_groups([*self.report.figures, *(() if self.job is None else self.job.figures)])
+        of_loads = [figure_of_limit(one) for one in self.loads if one.safe.limit is not None]
+        return in_groups([*self.report.figures, *of_loads, *(() if self.job is None else self.job.figures)])
 
 
 def analyse(
@@ -93,40 +98,66 @@ def analyse(
     *,
     proof: bool = True,
     stages: bool = True,
+    spec: Spec | None = None,
     campaigns: Sequence[Summary] = (),
     progress: Share | None = None,
 ) -> Analysis:
     """Compute all that the pages show of a subject.
 
     proof : whether margins of the parameters are proven
-    stages : whether every stage and each parameter alone has its margin, and |S| its worst case; otherwise the margin
-        of all parameters at once is the only one
+    stages : whether every stage and each parameter alone has its margin, |S| its worst case, and each load its largest
+        size of any waveform; otherwise the margin of all parameters at once is the only one
+    spec : whose [specification] judges it; None: the subject's own
     progress : takes the share of the work that is done
 
     Raises CheckError when numbers overflow or no input holds the machine.
     """
-    found = verify(
-        subject.plant, subject.controller, subject.box, stages=stages, proof=proof,
-        current_loops=subject.current_loops, progress=progress_of_part(progress, 0, 2),
-    )  # fmt: skip
+    with share_time(MARGIN_SHARE):
+        found = verify(
+            subject.plant, subject.controller, subject.box, stages=stages, proof=proof,
+            current_loops=subject.current_loops, progress=progress_of_part(progress, 0, 3),
+        )  # fmt: skip
     notes: list[str] = []
-    job = _main_job(subject, notes, progress_of_part(progress, 1, 2))
-    found = with_requirements(found, subject.spec, proof=proof, flights=True)
-    return Analysis(subject, found, job, tuple(campaigns), (*notes, *found.notes))
+    job = _main_job(subject, notes, progress_of_part(progress, 1, 3))
+    found = with_requirements(
+        found, spec or subject.spec, proof=proof, flights=True, progress=progress_of_part(progress, 2, 3)
+    )
+    loads = _limits_of_loads(found) if proof and stages else ()
+    return Analysis(subject, found, job, tuple(campaigns), (*notes, *found.notes), loads)
+
+
+def _limits_of_loads(found: LoopReport) -> tuple[LoadLimit, ...]:
+    """How large each load may be, whatever its waveform; none of an unstable loop, or where no load acts."""
+    if not (found.stable and found.plant.disturbances) or is_stopped():
+        return ()
+    from malta.margins.load_sizes import load_limits  # ball arithmetic: not for pages without a proof
+
+    return load_limits(found.loop, courses=True)
+
+
+def figure_of_limit(found: LoadLimit) -> Merit:
+    """The largest size of a load that is proven, as a figure of merit."""
+    safe = found.safe
+    words = f"any waveform of {safe.disturbance}: touches and saturates nothing up to"
+    return figure(
+        "load_safe", f"load {safe.disturbance} safe", words, safe.limit or 0.0, safe.unit, safe.disturbance
+    )
 
 
 def _main_job(subject: Subject, notes: list[str], progress: Share | None) -> Experiment | None:
     """The machine's main job; None, with a note, where it cannot be simulated."""
     plant = subject.plant
     name = main_job(plant)
+    if is_stopped():
+        notes.append(f"{name} was not simulated: {NO_TIME}")
+        return None
     try:
-        found = experiment(name, plant, subject.controller, progress=progress)
+        return whole_experiment(experiment(name, plant, subject.controller, progress=progress))
     except (InputError, CheckError) as error:
         notes.append(f"{name} was not simulated: {error}")
-        return None
-    if found.interrupted or any(case.run.verdict.name == "interrupted" for case in found.cases):
-        raise KeyboardInterrupt
-    return found
+    except WorkUp:
+        notes.append(f"{name} was not simulated to its end: {NO_TIME}")
+    return None
 
 
 # What a design is, entry by entry: machine, law, weights, noise, gains. Reports list it, comparisons seek changes.
@@ -226,7 +257,7 @@ def _law(subject: Subject) -> Iterator[FileEntry]:
     c = subject.controller
     yield FileEntry("law", "kind", kind_of(c))
     yield FileEntry("law", "sample time", c.sample_time, "s")
-    yield FileEntry("law", "delay in the design model", float(c.delay), "1")
+    yield FileEntry("law", "delay in the design model [samples]", float(c.delay), "1")
     yield FileEntry("law", "lag of the current loops in the design model", "yes" if c.lagging else "no")
     yield FileEntry("law", "integrals of errors", _sums(c) or "no")
     yield FileEntry("law", "observed forces of disturbance", "yes" if c.observed else "no")
@@ -348,8 +379,8 @@ class KeyFigure(NamedTuple):
 
 
 def key_figures(a: Analysis) -> list[KeyFigure]:
-    """List the figures that a reader looks for after the verdict: bandwidth, noise, main job."""
-    parts = (_bandwidth, _noise, _job)
+    """List the figures that a reader looks for after the verdict: bandwidth, noise, loads, main job."""
+    parts = (_bandwidth, _noise, _any_load, _job)
     return [figure for part in parts for figure in part(a)]
 
 
@@ -374,10 +405,23 @@ def _noise(a: Analysis) -> Iterator[KeyFigure]:
         texts = []
         for unit, (value, _) in largest.items():
             fine = FINE_UNITS.get(unit, unit)
-            shown = "" if fine == "1" else f" {micro(fine)}"
+            shown = "" if fine == "1" else f" {micro(fine)}".replace(" ", "\N{NO-BREAK SPACE}")
             texts.append(f"{number(in_unit(value, fine), 3)}{shown}")
         names = ", ".join(name for _, name in largest.values())
         yield KeyFigure(label, " · ".join(texts), f"rms of the worst: {names}")
+
+
+def _any_load(a: Analysis) -> Iterator[KeyFigure]:
+    proven = sorted(
+        (one for one in a.loads if one.safe.limit is not None), key=lambda one: -(one.safe.limit or 0.0)
+    )
+    smallest = {one.safe.unit: one for one in proven}
+    if smallest:
+        value = " · ".join(f"{one.proven.text(3)} {one.safe.unit}" for one in smallest.values())
+        names = ", ".join(one.safe.disturbance for one in smallest.values())
+        yield KeyFigure(
+            "Any load, touching nothing", value, f"proven, of any waveform: {names} is the smallest"
+        )
 
 
 def _job(a: Analysis) -> Iterator[KeyFigure]:

@@ -13,6 +13,7 @@ from rich.console import Group
 from rich.text import Text
 
 from malta.errors import InputError
+from malta.margins.outcome import Outcome, join_signals
 from malta.merit_lists import by_identifier, find_best
 from malta.merits import Merit
 from malta.report.page.analysis import (
@@ -25,13 +26,16 @@ from malta.report.page.analysis import (
     display_unit,
 )
 from malta.report.tables import Paragraph, new_table
-from malta.report.verdict import Stair, VerdictLine, staircase, verdict_lines
+from malta.report.verdict import SHOWN_FAILURES, Stair, VerdictLine, staircase, verdict_lines
 from malta.simulation.experiments import progress_of_part
+from malta.units import distinct
+from malta.work import share_time
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from malta.campaigns.summary import Summary
+    from malta.synthesis.spec import Spec
 
 MIN_DESIGNS, MAX_DESIGNS = 2, 8  # designs
 NOTHING_TEXT = "-"  # the text of a design that has no such entry or figure
@@ -115,6 +119,7 @@ class Comparison:
 
     names: tuple[str, ...]  # each once
     designs: tuple[Analysis, ...]
+    spec: Spec | None = None  # whose [specification] judges all of them; None: each is judged by its own
 
     def __repr__(self) -> str:
         return f"Comparison({', '.join(self.names)})"
@@ -164,18 +169,39 @@ class Comparison:
             return ()
         return tuple(Stair(name, lower) for name, lower in zip(self.names, known, strict=True))
 
+    @cached_property
+    def reference(self) -> int:
+        """The design that the others are better or worse than: the one whose file judges all of them, or the first."""
+        own = [a.subject.spec is not None and a.subject.spec is self.spec for a in self.designs]
+        return own.index(True) if any(own) else 0
+
+    @cached_property
+    def standings(self) -> tuple[VerdictLine, ...]:
+        """Whether each design is better or worse than the reference by its requirements, and where; () without them."""
+        if self.spec is None:
+            return ()
+        first = self.designs[self.reference].report.requirements
+        title = f"the reference, {_count_held(first)} of {self.spec.path.name}"
+        lines = []
+        for k, (name, a) in enumerate(zip(self.names, self.designs, strict=True)):
+            own = a.report.requirements
+            state = "good" if all(one.holds for one in own) else "bad"
+            if k == self.reference:
+                lines.append(VerdictLine(name, title, _failures(own), state))
+            else:
+                word, where = compare_outcomes(own, first)
+                note = "; ".join(filter(None, (_count_held(own), _failures(own), where)))
+                lines.append(VerdictLine(name, f"{word} {self.names[self.reference]}", note, state))
+        return tuple(lines)
+
     @property
     def judged_text(self) -> str:
-        """In how many of the figures that the design files bound each design is better; other figures are no score."""
-        judged = [
-            row
-            for row in self.rows
-            if sum(one is not None and one.bound is not None for one in row.scores) > 1
-        ]
-        if not judged:
-            return "No figure is bounded by the [specification] of two designs: none counts as better."
-        counts = (f"{name} in {sum(row.best[k] for row in judged)}" for k, name in enumerate(self.names))
-        return f"Better in the {len(judged)} figures that [specification] bounds: {', '.join(counts)}."
+        """Why no design is better or worse than another; "" where `standings` say which is."""
+        if self.spec is not None:
+            return ""
+        if not self.one_machine:
+            return "No [specification] judges machines that differ: none counts as better, and no figure is marked."
+        return "No [specification] judges all designs: none counts as better as a whole. --specification names one."
 
     @cached_property
     def one_machine(self) -> bool:
@@ -210,6 +236,11 @@ class Comparison:
         )
 
     @property
+    def is_marked(self) -> bool:
+        """Whether a figure of some design is better than another's."""
+        return any(any(row.best) for row in self.rows)
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """What is not compared, and why; what could not be computed."""
         found = []
@@ -236,19 +267,90 @@ class Comparison:
 
     def _is_judged(self, score: Merit) -> bool:
         """Whether one of the designs can be better by this figure."""
-        return score.meaning.scope != "box" or self.one_box
+        return self.one_machine and (score.meaning.scope != "box" or self.one_box)
+
+
+def compare_outcomes(own: Sequence[Outcome], other: Sequence[Outcome]) -> tuple[str, str]:
+    """Compare two designs by the same requirements: a verdict on the first, and where it is better and worse.
+
+    Better is a design that holds what the other holds and more; of two that hold the same, one that is nearer to no
+    limit and further from some.
+
+    >>> tight, loose = (Outcome("motion x", 1e-6, found, "m", "") for found in (0.9e-6, 0.8e-6))
+    >>> compare_outcomes([tight], [loose])
+    ('worse than', 'worse in motion x')
+    """
+    theirs = dict(zip(distinct(one.name for one in other), other, strict=True))
+    named = zip(distinct(one.name for one in own), own, strict=True)
+    pairs = [(one, theirs.get(key)) for key, one in named if one.asked is not None]
+    pairs = [(one, two) for one, two in pairs if two is not None and one.found_text != two.found_text]
+    better = [one for one, two in pairs if two is not None and one.ratio < two.ratio]
+    worse = [one for one, two in pairs if two is not None and one.ratio > two.ratio]
+    more, less = (
+        {one.name for one in side if one.asked is not None and not one.holds} for side in (other, own)
+    )
+    if more == less:
+        more, less = {one.name for one in better}, {one.name for one in worse}
+    words = {(True, False): "better than", (False, True): "worse than", (False, False): "as good as"}
+    where = [
+        f"{word} in {', '.join(join_signals(dict.fromkeys(one.name for one in side)))}"
+        for word, side in (("better", better), ("worse", worse))
+        if side
+    ]
+    return words.get((bool(more - less), bool(less - more)), "neither better nor worse than"), "; ".join(
+        where
+    )
+
+
+def _count_held(outcomes: Sequence[Outcome]) -> str:
+    asked = [one for one in outcomes if one.asked is not None]
+    kept = sum(one.holds for one in asked)
+    return (
+        f"holds all {kept} requirements"
+        if kept == len(asked)
+        else f"holds {kept} of {len(asked)} requirements"
+    )
+
+
+def _failures(outcomes: Sequence[Outcome]) -> str:
+    """What a design misses, the worst first, with its figures."""
+    missed = sorted(
+        (one for one in outcomes if one.asked is not None and not one.holds), key=lambda one: -one.ratio
+    )
+    texts = [f"{one.words} {one.found_text}, asked {one.asked_text}" for one in missed[:SHOWN_FAILURES]]
+    more = [f"{len(missed) - len(texts)} more"] if len(missed) > len(texts) else []
+    return f"misses {'; '.join((*texts, *more))}" if texts else ""
+
+
+def judging_spec(subjects: Sequence[Subject], named: Spec | None = None) -> Spec | None:
+    """The design whose [specification] judges all of some designs: the named one, else the first of their own.
+
+    None where they are of different machines. Raises InputError for a named one of another machine, or without.
+    """
+    machines = {(plant.name, *(s.name for s in plant.outputs)) for plant in (one.plant for one in subjects)}
+    if named is not None:
+        own = (named.plant.name, *(s.name for s in named.plant.outputs))
+        if machines != {own}:
+            raise InputError("--specification", "machine", named.plant.name, "that of all gain files")
+        if not named.specification:
+            raise InputError(named.path, "specification", "nothing", "what the designs shall reach")
+        return named
+    asking = (one.spec for one in subjects if one.spec is not None and one.spec.specification)
+    return next(asking, None) if len(machines) == 1 else None
 
 
 def compare(
     subjects: Sequence[Subject],
     *,
     proof: bool = True,
+    spec: Spec | None = None,
     campaigns: Sequence[Sequence[Summary]] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Analyse designs and put them beside each other.
 
     proof : whether the margin of the parameters is proven for each
+    spec : whose [specification] judges all of them; None: of the first that has one
     campaigns : summaries of the campaigns of each; (): none of any
     progress : takes the share of the work that is done
 
@@ -256,17 +358,15 @@ def compare(
     """
 
     require_count(len(subjects))
-    designs = [
-        analyse(
-            subject,
-            proof=proof,
-            stages=False,
-            campaigns=flown,
-            progress=progress_of_part(progress, n, len(subjects)),
-        )
-        for n, (subject, flown) in enumerate(zip(subjects, campaigns or [()] * len(subjects), strict=True))
-    ]
-    return Comparison(names_of(subjects), tuple(designs))
+    spec = judging_spec(subjects, spec)
+    designs, count = list[Analysis](), len(subjects)
+    for n, (subject, flown) in enumerate(zip(subjects, campaigns or [()] * count, strict=True)):
+        with share_time(1 / (count - n)):
+            part = progress_of_part(progress, n, count)
+            designs.append(
+                analyse(subject, proof=proof, stages=False, spec=spec, campaigns=flown, progress=part)
+            )
+    return Comparison(names_of(subjects), tuple(designs), spec)
 
 
 def require_count(count: int) -> None:
@@ -312,7 +412,9 @@ EDGE = 2  # letters at both ends of a line
 
 def comparison_tables(found: Comparison, width: int = 80) -> Group:
     """What differs in the designs, and their figures of merit, in blocks of designs that fit in `width` columns."""
-    parts: list[Any] = []
+    parts: list[Any] = [
+        Paragraph(f"{one.label}: {one.value}; {one.note}".rstrip("; ") + ".\n") for one in found.standings
+    ]
     verdict = [
         TableLine("", lines[0].label, _with_bars(lines, found.margins), tuple(False for _ in lines))
         for lines in zip(*found.verdicts, strict=True)
@@ -320,10 +422,12 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
     parts += [
         _table("Verdict", found.names, verdict, columns) for columns in _blocks(found.names, verdict, width)
     ]
-    parts.append(Paragraph(f"{found.judged_text}\n"))
+    if found.judged_text:
+        parts.append(Paragraph(f"{found.judged_text}\n"))
+    marks = f" ({BEST_MARK} and bold: better)" if found.is_marked else ""
     for title, lines in (
         ("What differs in the designs", found.difference_lines),
-        (f"Figures of merit ({BEST_MARK} and bold: better)", found.figure_lines),
+        (f"Figures of merit{marks}", found.figure_lines),
     ):
         for columns in _blocks(found.names, lines, width):
             parts.append(_table(title, found.names, lines, columns))

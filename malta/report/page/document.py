@@ -21,8 +21,7 @@ import numpy as np
 from malta.files import read_packaged, require_suffix
 from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.analysis import KeyFigure
-from malta.report.page.sections import Folded, Illustration, Item, PageTable, Section, plain_sheet, polish
-from malta.report.tables.experiments import finding_cells
+from malta.report.page.sections import Folded, Illustration, Item, PageTable, Section, polish
 from malta.writing import replace_files
 
 if TYPE_CHECKING:
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.arrays import FloatArray
-    from malta.identification.commission import Commissioning, JournalEntry
 
 
 # A figure as SVG that stands inside a page: colours by CSS variables, so that a dark page has light lines.
@@ -43,6 +41,7 @@ COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 REFERENCE = re.compile(r"url\(#([^)]+)\)")
 NUMBER = re.compile(r"-?\d+\.\d{3,}")
 ALONG_LABELS = ("time", "frequency")  # labels of axes along which one looks at curves
+MAX_TOLD_POINTS = 160  # points of a curve of which a page knows the frequency
 MAX_MARK_POINTS = 8  # points: what has fewer is no curve
 FONT = re.compile(r"font-family: [^;]*;? ?")
 
@@ -54,7 +53,7 @@ def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) 
     label : what the figure shows, for readers who do not see it
     styles : style -> class, of all figures of the page so far; those of this figure are added
     """
-    lines, entries = _mark_lines(figure)
+    lines, entries, along = _mark_lines(figure)
     root = ElementTree.fromstring(_svg_bytes(figure))
     named = dict.fromkeys(found for node in root.iter() for found in _references(node))
     names = {name: f"{prefix}-{number}" for number, name in enumerate([*named, *lines, *entries])}
@@ -70,18 +69,23 @@ def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) 
     root.attrib.update({"viewBox": box, "role": "img", "aria-label": printable(label), "style": least})
     told = {
         "axes": [_panel(axes, 72 * figure.get_size_inches()) for axes in figure.axes],
-        "lines": [{"id": names[key], "axes": k, "label": label} for key, (k, label) in lines.items()],
+        "lines": [
+            {"id": names[key], "axes": k, "label": label} | along.get(key, {})
+            for key, (k, label) in lines.items()
+        ],
         "legend": [{"id": names[key], "label": label} for key, label in entries.items()],
     }
     return ElementTree.tostring(root, encoding="unicode"), told
 
 
-def _mark_lines(figure: Figure) -> tuple[dict[str, tuple[int, str]], dict[str, str]]:
+def _mark_lines(
+    figure: Figure,
+) -> tuple[dict[str, tuple[int, str]], dict[str, str], dict[str, dict[str, Any]]]:
     """Name the lines of a figure that are data, and the texts of its legends, so that its SVG has these names.
 
     A line without a name of its own has that of the legend's line in its look.
 
-    Returns name -> (panel, label) of lines, and name -> label of legends.
+    Returns name -> (panel, label) of lines, name -> label of legends, and name -> the points of curves over frequency.
     """
     legends = [legend for legend in (*figure.legends, *(a.get_legend() for a in figure.axes)) if legend]
     looks: dict[str, str] = {}
@@ -94,6 +98,7 @@ def _mark_lines(figure: Figure) -> tuple[dict[str, tuple[int, str]], dict[str, s
             if handle is not None and hasattr(handle, "get_linestyle"):
                 looks[_look_of(handle)] = text.get_text()
     lines: dict[str, tuple[int, str]] = {}
+    along: dict[str, dict[str, Any]] = {}
     for k, axes in enumerate(figure.axes):
         for line in axes.lines:
             if line.get_gid() == BOUND_LINE or np.size(line.get_xdata()) < MAX_MARK_POINTS:
@@ -101,7 +106,16 @@ def _mark_lines(figure: Figure) -> tuple[dict[str, tuple[int, str]], dict[str, s
             name, label = f"line-{len(lines)}", str(line.get_label())
             line.set_gid(name)
             lines[name] = k, looks.get(_look_of(line), "") if label.startswith("_") else label
-    return lines, entries
+            if (known := getattr(line, "frequencies", None)) is not None:
+                along[name] = {"points": _points_over_frequency(*known)}
+    return lines, entries, along
+
+
+def _points_over_frequency(w: FloatArray, values: Any) -> list[list[float]]:
+    """Rows of frequency, rad/s, real and imaginary part, MAX_TOLD_POINTS at most of those that are drawn."""
+    drawn = np.flatnonzero(np.isfinite(values))
+    rows = drawn[:: max(1, -(-len(drawn) // MAX_TOLD_POINTS))]
+    return [[float(f"{number:.4g}") for number in (w[k], values[k].real, values[k].imag)] for k in rows]
 
 
 def _look_of(line: Any) -> str:
@@ -315,6 +329,7 @@ class Front:
     figures: Sequence[KeyFigure] = ()
     foot: str = ""
     verdict: str = ""  # an element of HTML
+    machine: str = ""  # the machine at rest, an element of SVG
 
 
 def render(
@@ -349,7 +364,7 @@ def render(
     policy, script = script_of(read_packaged("report/page/figures.js").decode())
     text = render_template(
         "page.html.jinja", title=title, kind=front.kind, heading=front.heading, about=front.about,
-        figures=front.figures, foot=front.foot, verdict=Markup(front.verdict),
+        figures=front.figures, foot=front.foot, verdict=Markup(front.verdict), machine=Markup(front.machine),
         sections=parts, style=Markup(page_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
         policy=policy, script=Markup(script), panels=Markup(json_in_page(told)),
     )  # fmt: skip
@@ -415,53 +430,3 @@ def script_of(text: str) -> tuple[str, str]:
 def page_style() -> str:
     """The style of all pages."""
     return read_packaged("report/page/style.css").decode()
-
-
-# The page of a commissioning for the lab's binder: steps, findings with limits, logs, signature.
-
-
-def binder_page(done: Commissioning) -> Page:
-    """Write a commissioning as one page in HTML that needs no network and no other file, with a place to sign."""
-    passed = sum(entry.passed for entry in done.entries)
-    state = "good" if done.passed else "bad"
-    heads = [
-        KeyFigure("steps passed", f"{passed} of {len(done.steps)}", "", state),
-        KeyFigure("signature", done.signature[:16], "sha256 of the gain file, logs and results"),
-    ]
-    front = Front("Commissioning", done.gains, f"Machine {done.machine}", heads, "malta commission")
-    return render(front, [*map(_section, done.entries), _signature_section(done)])
-
-
-def _section(entry: JournalEntry) -> Section:
-    """A step: its question, its findings, and why it was refused."""
-    state = "passed" if entry.passed else "FAILED"
-    items = [] if not entry.refusal else [entry.refusal]
-    sheet = plain_sheet(
-        "", ("finding", "found", "95 %", "limits", ""), [finding_cells(one) for one in entry.findings]
-    )
-    return Section(entry.name, f"{entry.question} {state}", (*items, *([sheet] if entry.findings else [])))
-
-
-def _signature_section(done: Commissioning) -> Section:
-    """The files with their sha256, the signature, and lines for names."""
-    rows = [(done.gains, done.sha256), *((e.log, e.sha256) for e in done.entries if e.sha256)]
-    lines = ("Date, name: ______________________________", "Witness: ______________________________")
-    sheet = plain_sheet("Files", ("file", "sha256"), rows)
-    return Section("signature", "Signature", (sheet, f"Signature {done.signature}", *lines))
-
-
-def binder_text(done: Commissioning) -> str:
-    """The same as plain text."""
-    lines = [f"Commissioning of a {done.machine}, gain file {done.gains}", f"sha256 {done.sha256}", ""]
-    for entry in done.entries:
-        lines.append(f"{entry.name}: {entry.question} {'passed' if entry.passed else 'FAILED'}")
-        lines += [f"    {entry.refusal}"] if entry.refusal else []
-        for one in entry.findings:
-            name, found, half, limits, word = finding_cells(one)
-            lines.append(
-                f"    {name}: {found} +- {half}{'' if not limits else f', {limits}'} {word}".rstrip()
-            )
-        lines += [f"    {entry.log} sha256 {entry.sha256}"] if entry.sha256 else []
-    left = done.steps[len(done.entries) :]
-    lines += [f"not gone: {' '.join(left)}"] if left else []
-    return "\n".join([*lines, "", f"signature {done.signature}", "", "Date, name:", "Witness:", ""])

@@ -73,9 +73,16 @@ function look(panel, event) {
   }
 }
 
+// The frequency at a place of a curve that knows it, as of a Nyquist plot.
+function frequencyAt(line, x, y) {
+  if (!line.told?.length) return "";
+  const far = ([, re, im]) => Math.hypot(re - x, im - y), [w] = line.told.reduce((one, other) => (far(other) < far(one) ? other : one));
+  return ` at ${digits(w)} rad/s (${digits(w / (2 * Math.PI))} Hz)`;
+}
+
 function tell(panel, found, event) {
   const { x, y } = panel.axes;
-  const rows = found.map(({ line, x: px, y: py }) => `${line.label ? `${line.label.replace(/:/g, "")}: ` : ""}${panel.along ? "" : `${digits(panel.toX.value(px))}, `}${digits(panel.toY.value(py))}`);
+  const rows = found.map(({ line, x: px, y: py }) => `${line.label ? `${line.label.replace(/:/g, "")}: ` : ""}${panel.along ? "" : `${digits(panel.toX.value(px))}, `}${digits(panel.toY.value(py))}${panel.along ? "" : frequencyAt(line, panel.toX.value(px), panel.toY.value(py))}`);
   if (!rows.length) return;
   const head = panel.along ? x.label.replace(/^(\w+)(?: \[(.*)\])?$/, (_, name, unit) => `${name} ${digits(panel.toX.value(found[0].x))} ${unit ?? ""}`) : `${x.label}, ${y.label}`;
   readout.replaceChildren(...[head, ...rows, ...(panel.along ? [y.label] : [])].filter(Boolean).map((text, k) => {
@@ -128,6 +135,7 @@ function channels(one, lines) {
     const own = lines.filter((line) => line.label === entry.label);
     if (!node || !own.length) continue;
     node.classList.add("channel");
+    node.closest("svg").setAttribute("role", "group"); // no picture any more: parts of it are pressed
     node.setAttribute("tabindex", "0");
     node.setAttribute("role", "button");
     node.setAttribute("aria-pressed", "true");
@@ -142,7 +150,7 @@ function channels(one, lines) {
 }
 
 document.querySelectorAll("figure svg").forEach((svg, k) => {
-  const one = figures[k], lines = one.lines.map((line) => ({ ...line, node: document.getElementById(line.id) })).filter((line) => line.node);
+  const one = figures[k], lines = one.lines.map((line) => ({ ...line, told: line.points, node: document.getElementById(line.id) })).filter((line) => line.node);
   for (const line of lines) line.points = pointsOf(line.node);
   const own = one.axes.map((axes, n) => {
     const marks = make("g", { class: "marks" });

@@ -13,13 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from malta.display import micro, quantity
 from malta.errors import InputError
 from malta.files import read_file, read_packaged
-from malta.model.rigid_body import Body, rotation
+from malta.model.rigid_body import Body
+from malta.report.page.bodies import (
+    VIEW,
+    Mesh,
+    camera,
+    draw_order,
+    mesh_of,
+    place_points,
+    poses_of,
+    upright_axis,
+)
 from malta.tables import read_npz
 
 if TYPE_CHECKING:
@@ -32,23 +41,14 @@ if TYPE_CHECKING:
 
 FRAMES = 240  # of a run
 MAX_PAGE_BYTES = 4_500_000  # bytes of a page: runs of longer ones show fewer frames
-SIDES = 28  # of a cylinder
 MAGNIFIED_SHARE = 0.01  # of the largest body: what moves less is magnified
 HEAD = 16.0  # of an arrow, pixels of the animated picture at twice its size
 ARROW = 0.2  # of the largest body: the arrow of the scale
 SHOWN_MOTION_SHARE = 0.12  # of the smallest side of a moving body: the largest magnified motion
-VIEW = (math.radians(-38), math.radians(24))  # turn about the upright axis, and height of the eye
 INKS: Mapping[str, tuple[int, int, int]] = {
-    "paper": (255, 255, 255), "mover": (86, 143, 196), "still": (150, 150, 150), "text": (40, 44, 48),
-    "trace": (125, 41, 6), "force": (176, 58, 8), "torque": (40, 44, 48),
+    "paper": (255, 255, 255), "text": (40, 44, 48), "torque": (40, 44, 48),
+    "trace": (125, 41, 6), "force": (176, 58, 8),
 }  # fmt: skip
-
-
-class Mesh(NamedTuple):
-    """A body as flat faces: points in its own frame, m, and the points of each face in order."""
-
-    points: FloatArray  # n x 3
-    faces: tuple[tuple[int, ...], ...]
 
 
 class Arrow(NamedTuple):
@@ -86,26 +86,6 @@ class Animation:
     factor: float
     signals: Mapping[str, FloatArray]
     arrows: tuple[Arrow, ...] = ()
-
-
-def mesh_of(body: Body) -> Mesh:
-    """The faces of a box or of a cylinder about z.
-
-    >>> from malta.model.rigid_body import Body
-    >>> len(mesh_of(Body("plate", "box", (1.0, 1.0, 0.1))).faces)
-    6
-    """
-    half = np.array(body.size) / 2
-    if body.form == "box":
-        signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-        around = tuple((k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k) for k in range(4))
-        return Mesh(signs * half, ((3, 2, 1, 0), (4, 5, 6, 7), *around))
-    turn = 2 * np.pi * np.arange(SIDES) / SIDES
-    ring = np.column_stack([half[0] * np.cos(turn), half[1] * np.sin(turn)])
-    points = np.vstack([np.column_stack([ring, np.full(SIDES, side * half[2])]) for side in (-1, 1)])
-    next_of = [(k + 1) % SIDES for k in range(SIDES)]
-    around = tuple((k, next_of[k], SIDES + next_of[k], SIDES + k) for k in range(SIDES))
-    return Mesh(points, (tuple(range(SIDES - 1, -1, -1)), tuple(range(SIDES, 2 * SIDES)), *around))
 
 
 def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Animation:
@@ -161,11 +141,11 @@ def _motion(
     kept = np.unique(np.linspace(0, len(t) - 1, frames).astype(int))
     states = dict(zip((s.name for s in plant.states), x[kept].T, strict=True))
     bodies = tuple(plant.bodies())
-    poses = np.stack([_poses(body, states, len(kept)) for body in bodies])
+    poses = np.stack([poses_of(body, states, len(kept)) for body in bodies])
     small, factor = _magnify(bodies, poses)
     shown = {name: np.asarray(values[kept]) for name, values in signals.items()}
     arrows = _arrows(bodies, plant, force[kept])
-    return Animation(title, ended, t[kept], bodies, poses, _upright(plant), small, factor, shown, arrows)
+    return Animation(title, ended, t[kept], bodies, poses, upright_axis(plant), small, factor, shown, arrows)
 
 
 def _arrows(bodies: Sequence[Body], plant: Plant, force: FloatArray) -> tuple[Arrow, ...]:
@@ -221,22 +201,6 @@ def _series(file: Path, plant: Plant) -> Mapping[str, Any]:
     return arrays
 
 
-def _poses(body: Body, states: Mapping[str, FloatArray], count: int) -> FloatArray:
-    """Place and Cardan angles of a body in every frame."""
-    columns = [states.get(name, np.zeros(count)) for name in (*body.moves, *[""] * (6 - len(body.moves)))]
-    return np.asarray(np.column_stack(columns) + np.append(body.place, np.zeros(3)))
-
-
-def _upright(plant: Plant) -> int:
-    """The axis against which the weight of the mover acts; z where none is told."""
-    names = [s.name for s in plant.disturbances]
-    if not {"F_x", "F_y", "F_z"} <= {*names}:
-        return 2
-    load = np.abs(np.array(ca.DM(plant.load(ca.DM.zeros(len(plant.states))))).ravel())
-    size = [load[names.index(f"F_{axis}")] for axis in "xyz"]
-    return int(np.argmax(size)) if max(size) > 0 else 2
-
-
 def _magnify(bodies: Sequence[Body], poses: FloatArray) -> tuple[FloatArray, float]:
     """Which coordinates of each body are magnified, and a factor of 1, 2 or 5 times a power of ten that shows them."""
     largest = max(max(body.size) for body in bodies)
@@ -252,31 +216,20 @@ def _magnify(bodies: Sequence[Body], poses: FloatArray) -> tuple[FloatArray, flo
     return small, max(step * power for step in (1, 2, 5) if step * power <= max(shown, 1.0))
 
 
-def place_points(mesh: Mesh, pose: FloatArray) -> FloatArray:
-    """The points of a body in the frame of the stator, n x 3."""
-    return np.asarray(mesh.points @ np.array(ca.DM(rotation(pose[3:]))) + pose[:3])
-
-
-def camera(up: int, turn: float, height: float) -> FloatArray:
-    """Rows: to the right, up and towards the eye, for the upright axis `up`."""
-    upright, across, along = (np.eye(3)[(up + k) % 3] for k in range(3))
-    eye = math.cos(height) * (math.cos(turn) * across + math.sin(turn) * along) + math.sin(height) * upright
-    right = np.cross(upright, eye)
-    right /= np.linalg.norm(right)
-    return np.vstack([right, np.cross(eye, right), eye])
-
-
 def magnify(found: Animation, k: int, body: int, factor: float) -> FloatArray:
     """The pose of a body in a frame, small motion about its mean times a factor."""
     pose, rest = found.poses[body, k], found.poses[body].mean(axis=0)
     return np.asarray(np.where(found.small[body], rest + factor * (pose - rest), pose))
 
 
-def motion_gif(found: Animation, *, size: tuple[int, int] = (520, 320), frames: int = 60) -> bytes:
+def motion_gif(
+    found: Animation, *, size: tuple[int, int] = (520, 320), frames: int = 60, dark: bool = False
+) -> bytes:
     """Draw the motion as an animated picture, which repeats.
 
     size : pixels
     frames : so many, evenly over the run
+    dark : for a dark page
     """
     from PIL import Image
 
@@ -288,6 +241,12 @@ def motion_gif(found: Animation, *, size: tuple[int, int] = (520, 320), frames: 
     pictures = [_draw_frame(found, int(k), meshes, view, ends, size) for k in shown]
     palette = pictures[len(pictures) // 2].quantize(48, Image.Quantize.MAXCOVERAGE)
     drawn = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    if dark:
+        from malta.report.page.document import dark_colours
+
+        rows = np.array(palette.getpalette()).reshape(-1, 3) / 255
+        for picture in drawn:
+            picture.putpalette(np.round(255 * dark_colours(rows)).astype(int).ravel().tolist())
     buffer = io.BytesIO()
     drawn[0].save(buffer, "GIF", save_all=True, append_images=drawn[1:], duration=66, loop=0, optimize=True)
     return buffer.getvalue()
@@ -324,7 +283,7 @@ def _page_data(runs: Sequence[Animation], every: int) -> dict[str, Any]:
     upright = camera(first.up, 0.0, 0.0)
     return {
         "view": VIEW, "up": np.eye(3)[first.up].tolist(), "across": upright[2].tolist(), "along": upright[0].tolist(),
-        "reach": max(float(np.linalg.norm(body.size)) for body in first.bodies),
+        "reach": max(float(2 * np.linalg.norm(b.place) + np.linalg.norm(b.size)) for b in first.bodies),
         "arrow": ARROW * max(max(body.size) for body in first.bodies),
         "bodies": [
             {"points": _digits(mesh.points), "faces": mesh.faces, "moves": bool(body.moves)}
@@ -387,25 +346,14 @@ def _draw_frame(
     low, high = ends.min(axis=0), ends.max(axis=0)
     scale = 0.9 * min(big[0] / (high[0] - low[0]), 0.74 * big[1] / (high[1] - low[1]))
     middle = np.array([big[0] / 2, 0.47 * big[1]])
-    polygons = []
-    for n, (body, mesh) in enumerate(zip(found.bodies, meshes, strict=True)):
-        points = place_points(mesh, magnify(found, k, n, found.factor)) @ view.T
-        flat = middle + scale * (points[:, :2] - (low + high)[:2] / 2) * [1, -1]
-        for face in mesh.faces:
-            a, b, c = points[list(face[:3])]
-            normal = np.cross(b - a, c - a)
-            normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
-            outline = [(float(x), float(y)) for x, y in flat[list(face)]]
-            polygons.append((float(points[list(face), 2].mean()), bool(body.moves), normal, outline))
-    # From the back to the front: backs of still bodies, moving bodies, fronts of still ones.
-    for _, moves, normal, outline in sorted(polygons, key=lambda one: (_layer(one[1], one[2]), one[0])):
-        if moves and normal[2] > 0:
-            light = 0.62 + 0.38 * max(0.0, float(normal @ [0.25, 0.6, 0.75]))
-            pen.polygon(outline, fill=tuple(round(light * part) for part in INKS["mover"]))
-        elif not moves:
-            pen.line(
-                [*outline, outline[0]], fill=INKS["still"] if normal[2] > 0 else (205, 205, 205), width=2
-            )
+    poses = [magnify(found, k, n, found.factor) for n in range(len(meshes))]
+    for face in draw_order(found.bodies, meshes, poses, view):
+        flat = middle + scale * (face.outline - (low + high)[:2] / 2) * [1, -1]
+        outline = [(float(x), float(y)) for x, y in flat]
+        if face.moves:
+            pen.polygon(outline, fill=face.ink)
+        else:
+            pen.line([*outline, outline[0]], fill=face.ink, width=2)
     _draw_arrows(
         pen, found, k, lambda point: middle + scale * (view @ point - (low + high) / 2)[:2] * [1, -1]
     )
@@ -478,8 +426,3 @@ def _draw_arrow(
             ],
             fill=ink,
         )
-
-
-def _layer(moves: bool, normal: FloatArray) -> int:
-    """The order in which faces are drawn: 0 first."""
-    return 1 if moves else 2 if normal[2] > 0 else 0

@@ -10,10 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from malta.arguments import describe, is_number
 from malta.errors import InputError
-from malta.report.figures.drawing import MORE_STYLES, STYLES, draw_line, finish_axes, micro, new_figure
+from malta.report.figures.drawing import (
+    MORE_STYLES,
+    STYLES,
+    draw_bound,
+    draw_line,
+    finish_axes,
+    micro,
+    new_figure,
+)
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Illustration, Item, PageTable, Section, distinct_channels, polish
-from malta.report.verdict import SIGNS, stairs_html
+from malta.report.verdict import SIGNS, stairs_html, verdict_html
+from malta.synthesis.curve_limits import curve_limits
 from malta.units import FINE_UNITS, in_unit
 
 if TYPE_CHECKING:
@@ -22,10 +31,12 @@ if TYPE_CHECKING:
 
     from malta.campaigns.summary import Summary
     from malta.gains.schema import GainFile
+    from malta.identification.log import Log
     from malta.model.plant import Parameters
     from malta.report.page.analysis import Analysis, Subject
     from malta.report.page.comparison import Comparison, TableLine
     from malta.synthesis.controller import Controller
+    from malta.synthesis.curve_limits import CurveLimit
     from malta.synthesis.spec import Spec
 
 WORK = 0.75  # share of the work that is done when all is computed; the rest is drawing
@@ -38,6 +49,7 @@ def gain_page(
     uncertainty: Mapping[str, float] | None = None,
     spec: Spec | None = None,
     campaigns: Sequence[Summary] = (),
+    logs: Sequence[Log] = (),
     proof: bool = True,
 ) -> Page:
     """Report a gain file, or a controller, as one page in HTML that needs no network and no other file.
@@ -47,6 +59,7 @@ def gain_page(
     uncertainty : parameter -> share, either way, at margin 1; None: those of the gain file, none of a controller
     spec : the design, whose [specification] is judged; None: none
     campaigns : summaries of campaigns of these gains
+    logs : of the machine under this controller, from `malta.identification.read_log`
     proof : whether margins are proven, which takes seconds
 
     Returns a Page: a notebook shows it, and its `save` writes it.
@@ -63,21 +76,25 @@ def gain_page(
     from malta.report.page.analysis import analyse
 
     subject = subject_of(gains, parameters=parameters, uncertainty=uncertainty, spec=spec)
-    return page_of(analyse(subject, proof=proof, campaigns=campaigns))
+    return page_of(analyse(subject, proof=proof, campaigns=campaigns), logs)
 
 
 def compare_gains(
-    *gains: str | Path | Controller, uncertainty: Mapping[str, float] | None = None, proof: bool = True
+    *gains: str | Path | Controller,
+    uncertainty: Mapping[str, float] | None = None,
+    spec: Spec | None = None,
+    proof: bool = True,
 ) -> Comparison:
     """Compare 2 to 8 gain files, or controllers: what differs, and figures of merit with the better one marked.
 
     gains : gain files, or controllers
     uncertainty : parameter -> share, either way, at margin 1, of all designs; None: of each gain file its own
+    spec : the design whose [specification] judges all of them; None: none
     proof : whether the margin of the parameters is proven for each, which takes seconds
 
-    Returns a Comparison with `names`, `differences` and `rows`, the figures of merit.
+    Returns a Comparison with `names`, `differences`, `rows`, the figures of merit, and `standings`, what is better.
 
-    Raises InputError for another number of them, and as `malta.gains.read`.
+    Raises InputError for another number of them, a specification of another machine, and as `malta.gains.read`.
 
     >>> import malta
     >>> files = [f"examples/ball/design/{name}.toml" for name in ("ball", "ball_pid")]
@@ -91,7 +108,7 @@ def compare_gains(
     from malta.report.page.comparison import compare, require_count
 
     require_count(len(gains))
-    return compare([subject_of(one, uncertainty=uncertainty) for one in gains], proof=proof)
+    return compare([subject_of(one, uncertainty=uncertainty) for one in gains], proof=proof, spec=spec)
 
 
 def subject_of(
@@ -130,19 +147,30 @@ def provenance_of(file: GainFile) -> tuple[tuple[str, str], ...]:
     return (("sha256 of the gain file's content", file.sha256), *versions)
 
 
-def page_of(found: Analysis, progress: Callable[[float], None] | None = None) -> Page:
-    """Write an analysis as a page."""
+def page_of(
+    found: Analysis, logs: Sequence[Log] = (), progress: Callable[[float], None] | None = None
+) -> Page:
+    """Write an analysis as a page, with what logs show of the machine."""
     from malta.report.page.analysis import key_figures
+    from malta.report.page.bodies import machine_svg
     from malta.report.page.document import Front, render
     from malta.report.page.sections import report_sections
-    from malta.report.verdict import verdict_html, verdict_lines
+    from malta.report.verdict import verdict_lines
 
     c = found.subject.controller
     changes = f", changed: {', '.join(found.subject.changes)}" if found.subject.changes else ""
     about = f"Machine {found.plant.name}, preset {found.subject.parameters.preset}{changes}"
     verdict = verdict_html(verdict_lines(found.report, found.campaigns))
-    front = Front("Design report", c.name, about, key_figures(found), _foot(found), verdict)
-    return render(front, report_sections(found), progress)
+    front = Front(
+        "Design report", c.name, about, key_figures(found), _foot(found), verdict, machine_svg(found.plant)
+    )
+    sections = report_sections(found)
+    if logs:
+        from malta.report.page.bench import log_items
+
+        shown = [item for log in logs for item in log_items(c, log, found.subject.box)]
+        sections.append(Section("bench", "On the bench", tuple(shown)))
+    return render(front, sections, progress)
 
 
 def _foot(found: Analysis) -> str:
@@ -153,7 +181,12 @@ def _foot(found: Analysis) -> str:
 
 
 def report_work(
-    subject: Subject, *, proof: bool, campaigns: Sequence[Summary], progress: Callable[[float], None] | None
+    subject: Subject,
+    *,
+    proof: bool,
+    campaigns: Sequence[Summary],
+    logs: Sequence[Log] = (),
+    progress: Callable[[float], None] | None,
 ) -> tuple[Analysis, Page]:
     """Analyse a subject and write its page, behind one measure of progress."""
     from malta.report.page.analysis import analyse
@@ -164,7 +197,7 @@ def report_work(
 
     found = analyse(subject, proof=proof, campaigns=campaigns, progress=report_work_share)
     return found, page_of(
-        found, None if progress is None else lambda share: progress(WORK + (1 - WORK) * share)
+        found, logs, None if progress is None else lambda share: progress(WORK + (1 - WORK) * share)
     )
 
 
@@ -178,38 +211,46 @@ def overlaid(found: Comparison) -> Iterator[Item]:
     named = dict(zip(found.names, found.designs, strict=True))
     loops = {name: a.curves for name, a in named.items()}
     stable = {name: loops[name] for name, a in named.items() if a.report.stable}
-    panels = distinct_channels(loops)
+    panels, limits = distinct_channels(loops), curve_limits(found.spec)
+    asked = " Shaded in red: what the requirements exclude, hatched where a design fails." if limits else ""
     if stable and found.one_machine:
         shown = distinct_channels(stable)
         yield Illustration(
-            partial(plots.sensitivity_curves, stable, channel=shown.channels),
-            f"Sensitivity S and complementary sensitivity T, with the zones of ISO 14839-3.{shown.note}",
+            partial(plots.sensitivity_curves, stable, channel=shown.channels, limits=limits),
+            f"Sensitivity S and complementary sensitivity T, with the zones of ISO 14839-3.{shown.note}{asked}",
         )
     if found.one_machine:
         yield Illustration(
-            partial(plots.nyquist, loops, channel=panels.channels),
+            partial(plots.nyquist, loops, channel=panels.channels, limits=limits),
             f"Nyquist plots of the loop at each sensor, the others closed.{panels.note}",
         )
     if stable:
         yield Illustration(
-            partial(plots.sigma, stable), "Singular values of L, S and T with all sensors at once."
+            partial(plots.sigma, stable, limits=limits),
+            "Singular values of L, S and T with all sensors at once.",
         )
     if stable and found.one_machine and found.designs[0].plant.disturbances:
         yield Illustration(
-            partial(plots.load_response, stable),
+            partial(plots.load_response, stable, limits=limits),
             "Deviation after a unit step of each load from outside, and compliance over frequency.",
         )
     flown = [(name, a) for name, a in named.items() if a.job is not None]
     if found.one_machine and len(flown) > 1:
         yield Illustration(
-            lambda: _job_figure(flown),
+            lambda: _job_figure(flown, limits),
             "The main job on the nonlinear machine: the leading output, its distance from the reference, and the "
             "leading command.",
         )
 
 
-def _job_figure(designs: Sequence[tuple[str, Analysis]]) -> Figure:
-    """The leading output of the main job, its error, and the leading command, of the first run of each design."""
+LONG_JOB = 10.0  # s, beyond which a main job is drawn over seconds
+
+
+def _job_figure(designs: Sequence[tuple[str, Analysis]], limits: Sequence[CurveLimit]) -> Figure:
+    """The leading output of the main job, its error, and the leading command, of the first run of each design.
+
+    A bound of the error is a line, since it is judged on machines that differ.
+    """
     figure = new_figure("", size=(9.0, 6.4))
     figure.subplots_adjust(left=0.095, right=0.985, bottom=0.085, top=0.9, hspace=0.28)
     panels = figure.subplots(3, 1, sharex=True)
@@ -218,20 +259,25 @@ def _job_figure(designs: Sequence[tuple[str, Analysis]]) -> Figure:
     signal, force = plant.outputs[k], plant.inputs[m]
     shown = {"m": "mm", "rad": "mrad"}.get(signal.unit, signal.unit)
     fine = FINE_UNITS.get(signal.unit, signal.unit)
+    longest = max(float(a.job.run.t[-1]) for _, a in designs if a.job is not None)
+    unit, per = ("s", 1.0) if longest > LONG_JOB else ("ms", 1e-3)
     for (name, a), style in zip(designs, cycle((*STYLES, *MORE_STYLES)), strict=False):
         assert a.job is not None
         run = a.job.run
-        t = 1e3 * run.t
+        t = run.t / per
         draw_line(panels[0], t, in_unit(1.0, shown) * run.p[:, k], label=name, **style)
         draw_line(panels[1], t, in_unit(1.0, fine) * (run.p - run.reference)[:, k], **style)
         draw_line(panels[2], t, run.v[:, m], **style)
+    for limit in limits:
+        if limit.curve == "error" and signal.name in limit.signals:
+            draw_bound(panels[1], in_unit(limit.limit, fine), f"{limit.words} asked", both=True)
     labels = (
         f"{signal.name}{_in_brackets(shown)}",
         f"{signal.name}, off reference{_in_brackets(fine)}",
         f"command {force.name}{_in_brackets(force.unit)}",
     )
     for axes, label in zip(panels, labels, strict=True):
-        finish_axes(axes, "time [ms]" if axes is panels[-1] else "", label)
+        finish_axes(axes, f"time [{unit}]" if axes is panels[-1] else "", label)
     _add_legend(figure, panels[0])
     return figure
 
@@ -280,7 +326,7 @@ def comparison_page(found: Comparison, progress: Callable[[float], None] | None 
         " · ".join(found.names),
         f"Machine {machines}",
         foot="malta compare",
-        verdict=_margin_bars(found),
+        verdict=(verdict_html(found.standings) if found.standings else "") + _margin_bars(found),
     )
     sections = (
         Section("verdict", "Verdict", tuple(_verdicts(found))),
@@ -305,7 +351,8 @@ def _verdicts(found: Comparison) -> Iterator[Item]:
         marks.append(("", *(line.state for line in lines)))
     left = tuple(False for _ in found.names)
     yield PageTable("", ("", *found.names), tuple(rows), (False, *left), tuple(marks))
-    yield found.judged_text
+    if found.judged_text:
+        yield found.judged_text
 
 
 def _differences(found: Comparison) -> Iterator[Item]:
@@ -316,7 +363,8 @@ def _differences(found: Comparison) -> Iterator[Item]:
 
 
 def _figures(found: Comparison) -> Iterator[Item]:
-    yield f"{SIGN} and bold: better than another design, in digits that are shown. Ties are not marked."
+    if found.is_marked:
+        yield f"{SIGN} and bold: better than another design, in digits that are shown. Ties are not marked."
     yield _sheet(found.names, found.figure_lines)
     yield from found.remarks
 

@@ -42,6 +42,7 @@ from malta.report.tables.margins import (
     tolerance_table,
     worst_case_table,
 )
+from malta.synthesis.curve_limits import curve_limits
 from malta.units import FINE_UNITS, in_unit
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ if TYPE_CHECKING:
 
     from malta.loops.classical import Classical
     from malta.loops.curves import LoopCurves
-    from malta.margins.loop_report import LoopReport, Outcome
+    from malta.margins.loop_report import LoopReport
+    from malta.margins.outcome import Outcome
 
 
 # Which channels of a loop need a panel of their own: mirror images have the same curves.
@@ -239,6 +241,8 @@ def report_sections(a: Analysis) -> list[Section]:
 
 
 def _design(a: Analysis) -> Iterator[Item]:
+    from malta.report import plots
+
     yield from summary_sentences(a)
     groups: dict[str, list[list[str]]] = {}
     for entry in design_entries(a.subject):
@@ -247,6 +251,10 @@ def _design(a: Analysis) -> Iterator[Item]:
     heads = ("entry", "value", "unit")
     sheets = [plain_sheet(group.capitalize(), heads, rows) for group, rows in groups.items()]
     first = [sheet for sheet in sheets if sheet.title == "Law"]
+    yield Illustration(
+        partial(plots.block_diagram, a.subject.controller, a.plant),
+        "The loop, block by block: what acts, how often, how late and within which limits.",
+    )
     yield from first
     yield Folded("Machine, weights, noise and limits", tuple(sheet for sheet in sheets if sheet not in first))
 
@@ -260,8 +268,7 @@ def _requirements(a: Analysis) -> Iterator[Item]:
     ranked = sorted(a.report.requirements, key=lambda one: (RANKS[one.verdict], one.asked is None))
     for one in ranked:  # failures first
         state, word = _light(one)
-        of = "" if one.asked is None else one.nearness
-        rows.append([word, one.words, one.asked_text, one.found_text, of, one.how])
+        rows.append([word, one.words, one.asked_text, one.found_text, one.nearness, one.how])
         marks.append((state, "", "", "", "", ""))
     heads = ("", "requirement", "asked", "found", "of the limit", "from")
     sheet = plain_sheet("[specification] of the design file, measured with these gains", heads, rows)
@@ -277,8 +284,7 @@ def _light(one: Outcome) -> tuple[str, str]:
         return "near", "? undecided"
     if not one.holds:
         return "bad", "✗ fails"
-    # A test that is passed or failed has its bound as its figure.
-    return ("near", "✓ barely") if NEAR_BOUND_SHARE < one.ratio < 1 else ("good", "✓ holds")
+    return ("near", "✓ barely") if one.is_graded and one.ratio > NEAR_BOUND_SHARE else ("good", "✓ holds")
 
 
 def _poles(a: Analysis) -> Iterator[Item]:
@@ -333,9 +339,10 @@ def _margin_map(a: Analysis) -> Iterator[Item]:
     shares = found.robust.sensitivity
     x, y, *_ = sorted(found.uncertainty, key=lambda name: -shares.get(name, 0.0))
     drawn = margin_map_of(a.plant, a.subject.controller, (x, y), found.uncertainty, margin=found.robust)
+    over = " and ".join(drawn.words)
     yield Illustration(
         lambda: plots.margin_map(drawn, campaigns=a.campaigns),
-        f"Margin map over {x} and {y}{drawn.beside_text and f', {drawn.beside_text}'}: every machine in the blue "
+        f"Margin map over {over}{drawn.beside_text and f', {drawn.beside_text}'}: every machine in the blue "
         "box is proven stable. The line is the boundary of stability by eigenvalues, which prove nothing.",
     )
 
@@ -350,14 +357,15 @@ def _loop(a: Analysis) -> Iterator[Item]:
     from malta.report import plots
 
     loops = {a.subject.controller.name: a.curves}
-    panels = distinct_channels(loops)
-    sensitivity = (
-        plots.sensitivity_curves,
+    panels, limits = distinct_channels(loops), curve_limits(a.subject.spec)
+    asked = " Shaded in red: what the requirements exclude, hatched where they fail." if limits else ""
+    sensitivity: tuple[Callable[..., Any], str] = (
+        partial(plots.sensitivity_curves, limits=limits),
         "Sensitivity S and complementary sensitivity T at each sensor, with the zones of ISO 14839-3.",
     )
-    drawn = [
+    drawn: list[tuple[Callable[..., Any], str]] = [
         (
-            plots.nyquist,
+            partial(plots.nyquist, limits=limits),
             "Nyquist plots of the loop at each sensor, the others closed, with the circle of max|S|.",
         ),
         (
@@ -367,10 +375,12 @@ def _loop(a: Analysis) -> Iterator[Item]:
         (plots.gang_of_four, "Gang of four: what noise, references and forces do at each sensor."),
     ]
     for draw, caption in [sensitivity, *drawn] if a.report.stable else drawn[:2]:
-        yield Illustration(partial(draw, loops, channel=panels.channels), f"{caption}{panels.note}")
+        more = asked if isinstance(draw, partial) else ""
+        yield Illustration(partial(draw, loops, channel=panels.channels), f"{caption}{panels.note}{more}")
     if a.report.stable:
         yield Illustration(
-            partial(plots.sigma, loops), "Singular values of L, S and T with all sensors at once."
+            partial(plots.sigma, loops, limits=limits),
+            "Singular values of L, S and T with all sensors at once.",
         )
     published = published_figures(a.plant.name)
     tables: list[Any] = [sensitivity_table(a.report), bandwidth_table(a.report, published)]
@@ -386,15 +396,28 @@ def _loop(a: Analysis) -> Iterator[Item]:
 def _loads(a: Analysis) -> Iterator[Item]:
     if not a.report.recovery:
         return
-    from malta.report.figures.margins import recovery_figure
+    from malta.report import plots
 
-    c = a.subject.controller
+    loops, limits = {a.subject.controller.name: a.curves}, curve_limits(a.subject.spec)
     yield Illustration(
-        lambda: recovery_figure(a.plant, c, a.report.recovery),
+        partial(plots.load_response, loops, limits=limits),
         "Deviation after a unit step of each load from outside, and compliance over frequency, of the output that "
         "the load moves furthest.",
     )
     yield from sheets_of([recovery_table(a.report.recovery, a.plant)])
+    if not a.loads:
+        return
+    from malta.report.figures.loads import load_limits_figure
+    from malta.report.tables.loads import load_limits_table, load_limits_text, place_text
+
+    yield from sheets_of([load_limits_table(a.loads)])
+    yield load_limits_text(a.loads, place_text(a.report.loop))
+    if any(one.course for one in a.loads):
+        yield Illustration(
+            lambda: load_limits_figure(a.loads, a.subject.controller.name),
+            "The largest share of a clearance that any waveform of a load uses, over its size: proven of the nonlinear "
+            "machine up to the dashed line, and of the linear loop.",
+        )
 
 
 def _job_title(a: Analysis) -> str:

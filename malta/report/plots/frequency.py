@@ -19,6 +19,7 @@ from malta.report.plots.panels import (
     chosen_channels,
     decibels,
     draw_level,
+    draw_limit,
     finish_frequency,
     head_of,
     loops_of,
@@ -41,11 +42,13 @@ if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.loops.channel_margins import ChannelMargins
     from malta.loops.linear_loops import Place
+    from malta.synthesis.curve_limits import CurveLimit
 
 ONE_LOOP = "one loop at a time, the others closed"
 RANGE = (-100.0, 120.0)  # dB, of a loop gain that is drawn
 MIN_RANGE_DB = 6.0  # dB that an axis shows
 MAX_PHASE_STEP = 170.0  # degrees, between neighbours: a pole on the axis
+HIGHEST_TURN = 20.0  # degrees: phases begin from 200 below what the slope says to 160 above
 ZERO_GAIN_SHARE = 0.1  # of the value beside it: a loop gain that counts as zero at the end of the grid
 Channel = str | Sequence[str] | None
 
@@ -81,7 +84,7 @@ def bode(
         lines, shown = [], []
         for loop, curves, k, margins in loops_with_channel(loops, name, at):
             gain, style = curves.responses.alone(at)[:, k], styles[loop]
-            phase = phase_of(curves.w, gain, margins)
+            phase = phase_of(curves.w, gain)
             upper.plot(curves.w, decibels(gain), **style)
             lower.plot(curves.w, phase, **style)
             _draw_margins(upper, lower, curves, phase, margins, style)
@@ -99,23 +102,22 @@ def title_of(loops: Mapping[str, LoopCurves]) -> str:
     return plain(text if len(text) <= 40 else f"{text[:37]}...")
 
 
-def phase_of(w: FloatArray, gain: Any, margins: ChannelMargins) -> FloatArray:
-    """The unwrapped phase in degrees, within a half turn of -180 degrees at the gain crossing of the phase margin.
+def phase_of(w: FloatArray, gain: Any) -> FloatArray:
+    """The unwrapped phase in degrees, which begins where the slope of the gain lets it: an integrator at -90 degrees.
 
-    It falls by half a turn at a pole on the axis.
+    Where that is half a turn off, as of an unstable pole, it begins below. A pole on the axis lowers it by 180.
     """
     steps = np.mod(np.degrees(np.diff(np.angle(gain))) + 180, 360) - 180
     phase = math.degrees(np.angle(gain[0])) + np.append(
         0, np.cumsum(np.where(steps > MAX_PHASE_STEP, steps - 360, steps))
     )
-    known = [c for c in margins.gain_crossings if c.frequency == margins.phase_frequency]
-    crossing = known[0].frequency if known else float(w[len(w) // 2])
-    at = float(np.interp(math.log(crossing), np.log(w), phase))
+    slope = math.log(abs(gain[1]) / abs(gain[0])) / math.log(w[1] / w[0]) if abs(gain[0] * gain[1]) else 0.0
+    expected = 90 * round(slope)
     if abs(gain[-1]) < ZERO_GAIN_SHARE * abs(
         gain[-2]
     ):  # a zero at the Nyquist frequency, where any phase is as good
         phase[-1] = phase[-2]
-    return np.asarray(phase - 360 * round((at + 180) / 360))
+    return np.asarray(phase - 360 * math.floor((phase[0] - expected + HIGHEST_TURN) / 360 + 0.5))
 
 
 def _draw_margins(
@@ -168,7 +170,14 @@ def _finish_bode(upper: Axes, lower: Axes, shown: Sequence[LoopCurves]) -> None:
     finish_frequency(lower, shown, "phase [°]")
 
 
-def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: Any = None) -> Figure:
+def sigma(
+    source: Any,
+    controller: Any = None,
+    *,
+    at: Place = "sensors",
+    axes: Any = None,
+    limits: Sequence[CurveLimit] = (),
+) -> Figure:
     """Draw the singular values of L, S and T with all channels: the largest, the smallest, and the band between.
 
     Signals count in SI units, metres beside radians.
@@ -178,6 +187,7 @@ def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: A
     controller : of the plant, or the system C; None: the source has it
     at : where the loop is cut, "sensors" or "forces"
     axes : three axes, for L, S and T; None: a new figure
+    limits : regions that requirements exclude, from `malta.synthesis.curve_limits`
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -209,8 +219,18 @@ def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: A
         draw_level(panel, 0)
         _limit_decibels(panel)
         finish_frequency(panel, loops.values(), f"singular values of {letter} [dB]")
+        for limit in limits if letter == "T" and at == "sensors" else ():
+            if limit.curve == "T":
+                fails = any(not _holds_bandwidth(curves, limit) for curves in loops.values())
+                draw_limit(panel, (0, limit.high), (-math.inf, -3.01), limit.words, fails=fails)
         write_above(panel, letter, lines)
     return sheet.figure
+
+
+def _holds_bandwidth(curves: LoopCurves, limit: CurveLimit) -> bool:
+    """Whether the smallest singular value of T stays above a limit up to its end, of a stable loop."""
+    values = curves.singular_values(curves.responses.cut("sensors")[2])[:, -1]
+    return curves.stable and bool((values[curves.w <= limit.high] >= limit.limit).all())
 
 
 def _largest_text(curves: LoopCurves, values: FloatArray, letter: str) -> str:
@@ -226,7 +246,13 @@ def _largest_text(curves: LoopCurves, values: FloatArray, letter: str) -> str:
 
 
 def sensitivity_curves(
-    source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
+    source: Any,
+    controller: Any = None,
+    *,
+    channel: Channel = None,
+    at: Place = "sensors",
+    axes: Any = None,
+    limits: Sequence[CurveLimit] = (),
 ) -> Figure:
     """Draw `|S_ii|` and `|T_ii|` of each channel, with the zones of ISO 14839-3 and the peaks marked.
 
@@ -236,6 +262,7 @@ def sensitivity_curves(
     channel : the channel or channels, by name; None: all
     at : where the loop is cut, "sensors" or "forces"
     axes : `|S|` and `|T|` of every channel, as `figure.subplots(2, channels)` gives them; None: a new figure
+    limits : regions that requirements exclude, from `malta.synthesis.curve_limits`
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -282,8 +309,18 @@ def sensitivity_curves(
             panel.set_ylim(min(max(low, 1e-3), 0.1), max(min(high, 1e3), 8.0 if letter == "S" else 2.0))
             finish_frequency(panel, shown, f"|{letter}| [-]", labelled=panel is lower)
             draw_level(panel, 1)
+        for limit in limits if at == "sensors" else ():
+            if limit.curve == "S":
+                fails = fails_peak(loops, name, limit)
+                draw_limit(upper, (0, math.inf), (limit.limit, math.inf), limit.words, fails=fails)
         write_above(upper, name, lines)
     return sheet.figure
+
+
+def fails_peak(loops: Mapping[str, LoopCurves], channel: str, limit: CurveLimit) -> bool:
+    """Whether the peak sensitivity of a sensor is above a limit in some loop, as the judge of the requirement finds."""
+    found = [margins for *_, margins in loops_with_channel(loops, channel, "sensors")]
+    return any(not one.stable or one.peak_sensitivity > limit.limit for one in found)
 
 
 def _draw_zones(axes: Axes) -> None:

@@ -12,7 +12,16 @@ import numpy as np
 from malta.display import quantity
 from malta.errors import InputError
 from malta.loops.curves import LoopCurves, loop_curves
-from malta.report.figures.drawing import BOUND_STYLE, MORE_STYLES, NOTE, STYLES, draw_grid, new_figure, number
+from malta.report.figures.drawing import (
+    BOUND_LINE,
+    BOUND_STYLE,
+    MORE_STYLES,
+    NOTE,
+    STYLES,
+    draw_grid,
+    new_figure,
+    number,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +36,8 @@ LINE = 0.155  # inch, of text above a panel
 FOOT = 0.64  # inch, below a panel of frequency
 SECOND_AXIS_OFFSET = 16.0  # points, from the numbers below an axis to the same in Hz
 DECADES = 3.0  # shown below the first crossing of unit gain
+FORBIDDEN = "#b3261e"  # colour of what a requirement excludes
+LIMIT_LINE: dict[str, Any] = {"color": FORBIDDEN, "linewidth": 1.2, "gid": BOUND_LINE, "zorder": 2}
 MOST_LINES = 3  # loops whose margins are written above a panel
 PLACES: Mapping[str, str] = {"sensors": "at the sensors", "forces": "at the forces"}
 CLEAR_BOX: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.2}
@@ -301,6 +312,55 @@ def thin(style: Mapping[str, Any]) -> dict[str, Any]:
 def draw_level(axes: Axes, value: float) -> None:
     """A light line at a value of y."""
     axes.axhline(value, **BOUND_STYLE)
+
+
+def draw_limit(
+    axes: Axes,
+    along: tuple[float, float],
+    across: tuple[float, float],
+    text: str,
+    *,
+    fails: bool,
+    line: int | None = None,
+) -> None:
+    """A region of a panel with its final limits that curves may not enter: shaded, and hatched where one does.
+
+    along, across : the region, low and high, of x and y; what lies outside of the panel is cut off
+    text : the requirement
+    line : of several regions, in which line below the panel's top their texts stand; None: at the region's edge
+    """
+    edges = [sorted(axes.get_xlim()), sorted(axes.get_ylim())]
+    (left, right), (low, high) = (
+        (max(side[0], edge[0]), min(side[1], edge[1]))
+        for side, edge in zip((along, across), edges, strict=True)
+    )
+    if not (left < right and low < high):
+        return
+    upward = across[0] > edges[1][0]  # the region lies above its limit
+    level = low if upward else high
+    for style in region_styles(fails=fails):
+        axes.fill_between([left, right], low, high, **style)
+    axes.plot([left, right], [level, level], **LIMIT_LINE)
+    if right < edges[0][1]:
+        axes.plot([right, right], [low, high], **LIMIT_LINE)
+    up = upward and line is None
+    axes.annotate(
+        plain(f"{text} {'FAILS' if fails else 'asked'}"), (left, level if line is None else edges[1][1]),
+        xytext=(3, 2 if up else -2 - 9 * (line or 0)), textcoords="offset points", va="bottom" if up else "top",
+        zorder=6, **limit_text(fails=fails),
+    )  # fmt: skip
+
+
+def region_styles(*, fails: bool) -> list[dict[str, Any]]:
+    """The looks in which a region that a requirement excludes is drawn: shaded, then hatched, which has no ground."""
+    shade: dict[str, Any] = {"color": FORBIDDEN, "linewidth": 0, "zorder": 0.5, "alpha": 0.1 + 0.1 * fails}
+    lines: dict[str, Any] = {"facecolor": "none", "edgecolor": FORBIDDEN, "hatch": "////"}
+    return [shade, {**lines, "linewidth": 0, "zorder": 0.6}] if fails else [shade]
+
+
+def limit_text(*, fails: bool) -> dict[str, Any]:
+    """The look of the name of a region that a requirement excludes."""
+    return {**note_style(), "color": FORBIDDEN, "fontweight": "bold" if fails else "normal"}
 
 
 def note_style() -> dict[str, Any]:

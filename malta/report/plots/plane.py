@@ -357,30 +357,39 @@ def branch_paths(found: RootLocus) -> list[ComplexArray]:
     T = found.sample_time
     strip = math.inf if T is None else math.pi / T
     lines = [[complex(pole)] for pole in found.poles[0]]
+    columns = list(range(len(lines)))  # of the samples, in which each line is
     for before, after in pairwise(found.poles):
-        parting = {k: path[::-1] for k, path in _meeting_points(after, before, strip).items()}
-        between = _meeting_points(before, after, strip) | parting
+        meeting = _meeting_points(before, after, strip)
+        parting = {
+            real: (pair, path[::-1]) for pair, (real, path) in _meeting_points(after, before, strip).items()
+        }
+        between = meeting | parting
         for k, line in enumerate(lines):
-            line += [*between.get(k, ()), complex(after[k])]
+            columns[k], path = between.get(columns[k], (columns[k], ()))
+            line += [*path, complex(after[columns[k]])]
     paths = [np.array(line) for line in lines]
     if T is not None:
         paths = [np.where(path.real < math.log(DELAY) / T, complex(np.nan, np.nan), path) for path in paths]
     return [_cut(path, strip) for path in paths if np.isfinite(path).any()]
 
 
-def _meeting_points(pairs: ComplexArray, real: ComplexArray, strip: float) -> dict[int, ComplexArray]:
-    """Points from conjugate pairs to the real poles that they become, by branch; real: or on the edge of the strip."""
+def _meeting_points(
+    pairs: ComplexArray, real: ComplexArray, strip: float
+) -> dict[int, tuple[int, ComplexArray]]:
+    """The real poles that conjugate pairs become, and points on the way, by branch; real: or on the strip's edge."""
     edge, flat = (_is_flat(poles, strip) for poles in (real, pairs))
     on_edge = np.abs(real.imag) > strip / 2
     turned = edge & ~flat
-    found: dict[int, ComplexArray] = {}
-    for i in np.flatnonzero(turned & (pairs.imag > 0)):
-        twins = [j for j in np.flatnonzero(turned & (pairs.imag < 0)) if j not in found]
-        if not twins:
-            continue
-        j = min(twins, key=lambda k: abs(pairs[k] - pairs[i].conj()))
+    twins: dict[int, int] = {}
+    for i in np.flatnonzero(turned & (pairs.imag > 0)).tolist():
+        left = [j for j in np.flatnonzero(turned & (pairs.imag < 0)).tolist() if j not in twins.values()]
+        if left:
+            twins[i] = min(left, key=lambda k: abs(pairs[k] - pairs[i].conj()))
+    ends = _ends_of_alike(pairs, real, twins)
+    found: dict[int, tuple[int, ComplexArray]] = {}
+    for i, j in twins.items():
         lift = 1j * strip if on_edge[i] else 0.0  # the edge becomes the real axis
-        start, one, other = pairs[i] - lift, real[i].real, real[j].real
+        start, (one, other) = pairs[i] - lift, (real[k].real for k in ends[i])
         before, after = -(start.imag**2), (one - other) ** 2 / 4  # squares of half the difference
         meets = before / (before - after) if after > 0 else 1.0  # share of the interval
         shares = np.concatenate([meets * (1 - BEND[::-1]), meets + (1 - meets) * BEND[1:]])
@@ -388,9 +397,29 @@ def _meeting_points(pairs: ComplexArray, real: ComplexArray, strip: float) -> di
         half = np.sqrt(np.abs(before + shares * (after - before)))
         paired = shares <= meets
         upper = np.where(paired, 1j * np.sign(start.imag), np.sign(one - other)) * half
-        found[int(i)] = middle + upper + lift
-        found[int(j)] = middle + np.where(paired, upper.conj() - lift, lift - upper)
+        found[i] = ends[i][0], middle + upper + lift
+        found[j] = ends[i][1], middle + np.where(paired, upper.conj() - lift, lift - upper)
     return found
+
+
+def _ends_of_alike(
+    pairs: ComplexArray, real: ComplexArray, twins: Mapping[int, int]
+) -> dict[int, tuple[int, int]]:
+    """The two real poles that each pair becomes, by branch.
+
+    Of pairs that are alike, as of axes that nearly agree, the one that is lowest above the axis parts first and
+    furthest: it gets the outermost of their real poles.
+    """
+    ends: dict[int, tuple[int, int]] = {}
+    left = sorted(twins, key=lambda i: pairs[i].imag)
+    while left:
+        i, j = left[0], twins[left[0]]
+        reach = abs(pairs[i].imag) + abs(real[i].real - real[j].real)
+        alike = [k for k in left if abs(pairs[k] - pairs[i]) < reach]
+        poles = sorted((one for k in alike for one in (k, twins[k])), key=lambda one: real[one].real)
+        ends |= {k: (poles[-1 - n], poles[n]) for n, k in enumerate(alike)}
+        left = [k for k in left if k not in alike]
+    return ends
 
 
 def _is_flat(poles: ComplexArray, strip: float) -> NDArray[np.bool_]:

@@ -15,19 +15,22 @@ import numpy as np
 from malta.bound import at_least
 from malta.errors import InputError
 from malta.margins.margin_map import MarginMap, Others, margin_map_of
-from malta.report.figures.drawing import BOUND_STYLE, LEGEND, NOTE, draw_grid, new_figure
-from malta.report.plots.frequency import ONE_LOOP, Channel, phase_of, title_of
+from malta.report.figures.drawing import BOUND_LINE, BOUND_STYLE, LEGEND, NOTE, draw_grid, new_figure
+from malta.report.plots.frequency import ONE_LOOP, Channel, fails_peak, phase_of, title_of
 from malta.report.plots.panels import (
     CLEAR_BOX,
+    LIMIT_LINE,
     PLACES,
     chosen_channels,
     decibels,
+    limit_text,
     loops_of,
     loops_with_channel,
     margins_text,
     mark,
     new_sheet,
     plain,
+    region_styles,
     styles_of,
     thin,
     write_above,
@@ -42,6 +45,7 @@ if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.loops.channel_margins import ChannelMargins
     from malta.loops.linear_loops import Place
+    from malta.synthesis.curve_limits import CurveLimit
 
 MAX_LEFT_REACH = 4.0  # how far left of the origin a Nyquist plot reaches at most
 M_CIRCLES = (12.0, 6.0, 3.0, 1.0, 0.0, -3.0, -6.0, -12.0)  # dB of |T|
@@ -49,7 +53,13 @@ HEIGHTS = (-45.0, 60.0)  # dB, of a Nichols plot
 
 
 def nyquist(
-    source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
+    source: Any,
+    controller: Any = None,
+    *,
+    channel: Channel = None,
+    at: Place = "sensors",
+    axes: Any = None,
+    limits: Sequence[CurveLimit] = (),
 ) -> Figure:
     """Draw the Nyquist plot of the loop gain of each channel, the others closed.
 
@@ -63,6 +73,7 @@ def nyquist(
     channel : the channel or channels, by name; None: all
     at : where the loop is cut, "sensors" or "forces"
     axes : one for each channel; None: a new figure
+    limits : regions that requirements exclude, from `malta.synthesis.curve_limits`
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -85,11 +96,15 @@ def nyquist(
         for loop, curves, k, margins in found:
             style = styles[loop]
             gain = _inside(curves.responses.alone(at)[:, k], window)
-            panel.plot(gain.real, gain.imag, **style)
-            panel.plot(gain.real, -gain.imag, **{**style, "linewidth": 0.6})
+            curve: Any = panel.plot(gain.real, gain.imag, **style)[0]
+            curve.frequencies = curves.w, gain  # for a page, which tells them under the pointer
+            panel.plot(gain.real, -gain.imag, **{**style, "linewidth": 0.6}, gid=BOUND_LINE)
             _draw_direction(panel, gain, style)
             _draw_margins(panel, margins, style, window)
             lines.append((margins_text(margins, turns=True), style["color"]))
+        for limit in limits if at == "sensors" else ():
+            if limit.curve == "S":
+                _draw_exclusion(panel, limit, fails=fails_peak(loops, name, limit))
         panel.set_xlim(window[0], window[1])
         panel.set_ylim(-window[2], window[2])
         panel.set_aspect("equal", adjustable="box")
@@ -99,6 +114,18 @@ def nyquist(
         panel.set_ylabel("imaginary part of L [-]", fontsize=8.5)
         write_above(panel, name, lines)
     return sheet.figure
+
+
+def _draw_exclusion(axes: Axes, limit: CurveLimit, *, fails: bool) -> None:
+    """The disk about -1 that a bound of `|S|` keeps a loop out of."""
+    radius, turn = 1 / limit.limit, np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    for style in region_styles(fails=fails):
+        axes.fill(-1 + radius * turn.real, radius * turn.imag, **style)
+    axes.plot(-1 + radius * turn.real, radius * turn.imag, **LIMIT_LINE)
+    axes.annotate(
+        f"{limit.words} {'FAILS' if fails else 'asked'}", (-1, -radius), xytext=(0, -2), va="top", ha="center",
+        textcoords="offset points", zorder=6, **limit_text(fails=fails),
+    )  # fmt: skip
 
 
 def _window(found: list[ChannelMargins]) -> tuple[float, float, float]:
@@ -123,7 +150,7 @@ def _inside(gain: ComplexArray, window: tuple[float, float, float]) -> ComplexAr
 def _draw_circles(axes: Axes) -> None:
     """The unit circle, the axes and the critical point."""
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
-    axes.plot(turn.real, turn.imag, **BOUND_STYLE)
+    axes.plot(turn.real, turn.imag, gid=BOUND_LINE, **BOUND_STYLE)
     axes.axhline(0, color="#c8c8c8", linewidth=0.6)
     axes.axvline(0, color="#c8c8c8", linewidth=0.6)
     axes.plot(-1, 0, marker="+", markersize=10, markeredgewidth=1.8, color="#000000", zorder=5)
@@ -151,7 +178,7 @@ def _draw_margins(
         return
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
     near = -1 + turn / found.peak_sensitivity
-    axes.plot(near.real, near.imag, **{**thin(style), "linestyle": (0, (1, 1.5))})
+    axes.plot(near.real, near.imag, gid=BOUND_LINE, **{**thin(style), "linestyle": (0, (1, 1.5))})
     half = found.disk.size / 2
     if half < 1:  # -1 / f for the factors f = (1 + d) / (1 - d) with |d| <= half
         ends = -(1 + half) / (1 - half), -(1 - half) / (1 + half)
@@ -198,7 +225,7 @@ def nichols(
         lines, phases = [], []
         for loop, curves, k, margins in loops_with_channel(loops, name, at):
             gain, style = curves.responses.alone(at)[:, k], styles[loop]
-            phase, size = phase_of(curves.w, gain, margins), decibels(gain)
+            phase, size = phase_of(curves.w, gain), decibels(gain)
             shown = (size > HEIGHTS[0]) & (size < HEIGHTS[1])
             panel.plot(np.where(shown, phase, np.nan), np.where(shown, size, np.nan), **style)
             _draw_nichols_margins(panel, curves.w, phase, margins, style)
@@ -344,7 +371,7 @@ def margin_map(
     ...     spec.plant, controller, uncertainty={"m": 0.2, "C": 0.2}
     ... )
     >>> figure.axes[0].get_xlabel()
-    'm [kg]'
+    'mass of the sphere m [kg]'
     """
     found = source
     if not isinstance(source, MarginMap):
@@ -376,7 +403,7 @@ def margin_map(
 
 def _titles(found: MarginMap) -> tuple[str, str]:
     """The title, and the margin in words."""
-    title = plain(f"{found.name}: margin map over {found.x} and {found.y}")
+    title = plain(f"{found.name}: margin map over {found.words[0]} and {found.words[1]}")
     beside = plain(found.beside_text and f", {found.beside_text}")
     if found.margin is None:
         return title, f"nothing proven: the proof was left out{beside}"
@@ -453,8 +480,8 @@ def _finish(axes: Axes, found: MarginMap) -> None:
     axes.set_xlim(found.x_values[0], found.x_values[-1])
     axes.set_ylim(found.y_values[0], found.y_values[-1])
     for axis, name, unit, values in (
-        (axes.xaxis, found.x, found.units[0], found.x_values),
-        (axes.yaxis, found.y, found.units[1], found.y_values),
+        (axes.xaxis, found.words[0], found.units[0], found.x_values),
+        (axes.yaxis, found.words[1], found.units[1], found.y_values),
     ):
         power = 3 * math.floor(math.log10(max(abs(float(values[0])), abs(float(values[-1])), 1e-300)) / 3)
         own = [] if unit == "1" else [unit]

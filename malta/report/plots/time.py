@@ -15,6 +15,7 @@ from malta.report.plots.frequency import Channel, title_of
 from malta.report.plots.panels import (
     chosen_channels,
     draw_level,
+    draw_limit,
     finish_frequency,
     loops_of,
     loops_with_channel,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.loops.curves import LoopCurves
+    from malta.synthesis.curve_limits import CurveLimit
     from malta.synthesis.step_response import StepResponse
 
 SHOWN_TIME_FACTOR = 1.6  # times the longest settling time
@@ -207,7 +209,12 @@ def _finish_time(axes: Axes, window: float, y: str) -> None:
 
 
 def load_response(
-    source: Any, controller: Any = None, *, channel: Channel = None, axes: Any = None
+    source: Any,
+    controller: Any = None,
+    *,
+    channel: Channel = None,
+    axes: Any = None,
+    limits: Sequence[CurveLimit] = (),
 ) -> Figure:
     """Draw deviations after a constant load of 1 N or 1 N m from outside, and the compliance over frequency below.
 
@@ -216,6 +223,7 @@ def load_response(
     controller : of the plant, or the system C; None: the source has it
     channel : outputs, by name; None: of each load the output that it moves furthest
     axes : time and frequency of every load and output, as `figure.subplots(2, n)` gives them; None: a new figure
+    limits : regions that requirements exclude, from `malta.synthesis.curve_limits`
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -264,6 +272,8 @@ def load_response(
                 mark(lower, curves.w[int(size.argmax())], size.max(), style)
         _hold_range(upper, rows, window, scale)
         _spread_apart(upper, [scale * f.peak for f, c in zip(figures, shown, strict=True) if c.stable])
+        own = [one for one in limits if one.curve == "load" and one.load == load and output in one.signals]
+        _draw_load_limits(upper, own, rows, scale)
         _finish_time(upper, window, f"{output} [{_over(fine, units[1])}]")
         lower.set_yscale("log")
         low, high = lower.get_ylim()
@@ -271,6 +281,23 @@ def load_response(
         finish_frequency(lower, shown, f"|{output}/{load}| [{_over(fine, units[1])}]")
         write_above(upper, f"{load} → {output}", lines)
     return sheet.figure
+
+
+def _draw_load_limits(
+    axes: Axes, limits: Sequence[CurveLimit], rows: Sequence[tuple[str, StepResponse, int, int]], scale: float
+) -> None:
+    """What is asked of deviations, from a time on: regions above and below, so that the next of them is seen."""
+    shown = sorted(limits, key=lambda one: -one.limit)
+    for line, limit in enumerate(shown):
+        sizes = [(a.left(limit.low) if limit.low else a.largest)[k, column] for _, a, k, column in rows]
+        fails = not all(size <= limit.limit for size in sizes)
+        side = 1 if sum(axes.get_ylim()) >= 0 else -1
+        low, high = axes.get_ylim()
+        reach = max(abs(low), abs(high), 1.15 * scale * limit.limit)
+        axes.set_ylim(min(low, -reach) if side < 0 else low, max(high, reach) if side > 0 else high)
+        above = min((one.limit for one in shown[:line] if one.low <= limit.low), default=math.inf)
+        region = sorted((side * scale * limit.limit, side * scale * above))  # up to the next wider limit
+        draw_limit(axes, (limit.low, math.inf), (region[0], region[1]), limit.words, fails=fails, line=line)
 
 
 def _load_text(curves: LoopCurves, size: Any, found: StepFigures, scale: float, unit: str) -> str:

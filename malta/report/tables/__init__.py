@@ -234,11 +234,19 @@ class Paragraph:
 
 # Rows, cells and headings that several tables share.
 
+ROUNDING_LIMIT = 1e-9  # in its unit, up to which a value is shown as 0
+POWER_LIMIT = 1e-3  # below which it is shown as 4.7e-07
+
 
 def merit_text(merit: Merit) -> str:
     """Our value of a figure of merit, in its unit; counts without decimals."""
     count = merit.unit == "1" and merit.value.is_integer()
-    return f"{merit.value:.0f}" if count else number(in_unit(merit.value, merit.unit))
+    return f"{merit.value:.0f}" if count else digits_of(in_unit(merit.value, merit.unit))
+
+
+def digits_of(value: float, digits: int = 4) -> str:
+    """A number with so many digits; a small one with its power of ten, and what is rounding as 0."""
+    return f"{value:.{digits}g}" if ROUNDING_LIMIT < abs(value) < POWER_LIMIT else number(value, digits)
 
 
 def published_text(merit: Merit, published: Published) -> str:

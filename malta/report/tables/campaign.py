@@ -11,7 +11,7 @@ from rich.table import Table
 from malta.model.parameters import differences
 from malta.model.signal_groups import lateral_outputs
 from malta.report.figures.drawing import Published, number
-from malta.report.tables import Paragraph, add_row, end_cell, new_table
+from malta.report.tables import Paragraph, add_row, digits_of, end_cell, new_table
 from malta.simulation.engine.digest import verdicts
 from malta.units import in_unit
 
@@ -120,7 +120,7 @@ def _findings_table(found: Summary) -> Table:
         if not m.sketch.count:
             continue
         unit = in_unit(1.0, m.merit.unit)
-        cells = [number(float(v) * unit, 3) for v in (*m.percentiles(PERCENTILES), m.sketch.largest)]
+        cells = [digits_of(float(v) * unit, 3) for v in (*m.percentiles(PERCENTILES), m.sketch.largest)]
         if m.merit.bound is not None:
             bound = f"{in_unit(m.merit.bound, m.merit.unit):.6g}"
             at_most = m.merit.relation == "at most"
@@ -153,7 +153,10 @@ def _worst_table(found: Summary, count: int) -> Table:
             f"{index}",
             end_cell(ends[int(runs.batch.verdict[row])], completed=runs.batch.verdict[row] == 0),
             f"{runs.batch.duration[row] * 1e3:.1f}",
-            *(number(in_unit(float(runs.batch.deviation[row, g.columns].max()), g.fine), 3) for g in groups),
+            *(
+                digits_of(in_unit(float(runs.batch.deviation[row, g.columns].max()), g.fine), 3)
+                for g in groups
+            ),
             " ".join(_deviation_text(plan, name, value) for name, value in values),
         )
     return table

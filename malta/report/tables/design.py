@@ -10,20 +10,18 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
-from scipy import sparse
 
 from malta.bound import at_least, at_most
-from malta.checker.file import StabilityClaim, double, inside
 from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, Recovery, furthest
-from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
+from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, zone
+from malta.margins.outcome import Outcome
 from malta.model.linearize import LinearModel
 from malta.model.parameters import box_words
 from malta.model.printed import published_value
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table
-from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import FINE_UNITS, in_unit
 
@@ -61,6 +59,8 @@ def design_page(
     ball: LQG with integral action
     ball, preset data, sampled-data, 5 kHz, delay 1 in the design model
     """
+    from malta.synthesis.lqg import continuous_poles  # here: it loads what makes designs
+
     made = f"{spec.discretization}, {_rate_text(spec.sample_time)}, delay {spec.delay:g} in the design model"
     made += ", with the lag of the current loops" if spec.current_lag else ""
     if spec.pid is not None:
@@ -235,8 +235,10 @@ def sensitivity_table(margins: LoopReport) -> Table:
     """
     sensors = [k for k in margins.peak_sensitivity if k != "sigma_max"]
     limits = ", ".join(f"{name} < {limit:g}" for limit, name in ZONES if math.isfinite(limit))
+    units = {signal.unit for signal in margins.controller.measurements}
+    scaled = "" if len(units) == 1 else "; sigma_max: each reading in its noise, else its range"
     table = new_table(
-        f"Peak sensitivity (ISO 14839-3 zone of the worst: {limits})",
+        f"Peak sensitivity (ISO 14839-3 zone of the worst: {limits}{scaled})",
         "loop",
         *sensors,
         "zone",
@@ -258,6 +260,8 @@ def sensitivity_table(margins: LoopReport) -> Table:
 
 def _modes(model: LinearModel) -> tuple[list[str], FloatArray]:
     """Squares of the poles +-s of an undamped plant, each named by the position that takes part most in its mode."""
+    from scipy import sparse  # here, as it loads with all graphs
+
     names = [s.name for s in model.plant.design_states[: len(model.stiffness)]]
     squares, shapes = np.linalg.eig(model.stiffness)
     participation = np.abs(shapes * np.linalg.inv(shapes).T)  # of position i in mode j, free of units
@@ -279,51 +283,14 @@ def _pole_text(poles: ComplexArray) -> str:
     return "  ".join(text if count == 1 else f"{text} (x{count})" for text, count in counted.items())
 
 
-# What a certificate claims, for a terminal: of which loop, and in which box. Digits are cut towards less.
-
-
-DIGITS = 7  # of the ends of an interval
-LOOPS = {"lag": "current loops, if any, as first-order lags", "pi": "the PI current loops of the gain file"}
-
-
-def claim_text(claim: StabilityClaim) -> str:
-    """The loop that a certificate names: machine, law, stage and sample time."""
-    T = "continuous" if claim.sample_time is None else f"sampled every {double(claim.sample_time):g} s"
-    if claim.origin is None:
-        return f"Claim: of matrices alone, {T}"
-    o = claim.origin
-    text = f"Claim: {o.machine}, preset {o.preset}; law {o.law}, sha256 {o.sha256[:12]}..., {T}"
-    text += f"; with {LOOPS[o.current_loops]}"
-    if claim.places is not None:
-        at = ", ".join(f"{double(x):g}" for x in claim.places.at)
-        text += f"; at {claim.places.name} = {at} {claim.places.unit}, not between them"
-    return text
-
-
-def claim_share(claim: StabilityClaim) -> str:
-    """The multiple of the uncertainty that is claimed, in percent, cut."""
-    return at_least(double(claim.lower)).percent()
-
-
-def claim_table(claim: StabilityClaim) -> Table:
-    """The box of a certificate: each parameter with its nominal value and its interval at the claim, cut inwards."""
-    table = new_table(f"The box at {claim_share(claim)}", "parameter", "nominal", "from", "to", "unit")
-    for p in claim.parameters:
-        low, high = inside(*p.interval)
-        ends = [at_most(low).text(DIGITS), at_least(high).text(DIGITS)]
-        if not float(ends[0]) <= double(p.nominal) <= float(ends[1]):  # narrower than the digits
-            ends = [repr(low), repr(high)]
-        add_row(table, p.name, f"{double(p.nominal):.{DIGITS}g}", *ends, p.unit or "")
-    return table
-
-
 # The table of constant loads from outside: how far they move a machine, and how fast it comes back.
 
 
 def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     """Tabulate the output that each load moves furthest: largest deviation, what is left, settling, compliance.
 
-    The peak over frequency is the amplitude of the output under a load of this amplitude.
+    The peak over frequency is the amplitude of the output under a load of this amplitude. No load of this amplitude
+    moves it further than the column of any load says.
 
     found : from `malta.loops.recovery`
     plant : the machine
@@ -337,11 +304,11 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     >>> rich.print(malta.report.recovery_table(found, spec.plant))
     A constant load from outside, and the output that it moves furthest
     <BLANKLINE>
-                               left    left     1 %
-                      moves   after   after   after     peak      at rad/s
-     load    output      by   0.1 s   0.3 s     [s]   over w          (Hz)
-     ─────────────────────────────────────────────────────────────────────
-     1 N w   y [µm]   343.4   94.98   1.722   0.266    430.5   42.8 (6.82)
+                                       left    left     1 %
+                      moves     any   after   after   after     peak      at rad/s
+     load    output      by    load   0.1 s   0.3 s     [s]   over w          (Hz)
+     ─────────────────────────────────────────────────────────────────────────────
+     1 N w   y [µm]   343.4   686.9   94.98   1.722   0.266    430.5   42.8 (6.82)
     <BLANKLINE>
     """
     units = {s.name: s.unit for s in plant.disturbances}
@@ -350,6 +317,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
         "load",
         "output",
         "moves by",
+        "any load",
         *after,
         f"{100 * SHARE:g} % after [s]",
         "peak over w",
@@ -362,10 +330,21 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
         fine = FINE_UNITS.get(d.unit, d.unit)
         # Below a millionth of the largest nothing is left.
         left = (value if value > 1e-6 * d.largest else 0.0 for value in d.left)
-        lengths = [number(in_unit(value, fine)) for value in (d.largest, *left)]
+        any_waveform = at_most(in_unit(d.any_waveform, fine)).text()
+        moved, *rest = [number(in_unit(value, fine)) for value in (d.largest, *left)]
         settled = "never" if math.isinf(d.settled) else f"{d.settled:.3g}"
         peak = number(in_unit(d.compliance, fine))
-        add_row(table, load, f"{d.output} [{fine}]", *lengths, settled, peak, frequency(d.frequency, 3))
+        add_row(
+            table,
+            load,
+            f"{d.output} [{fine}]",
+            moved,
+            any_waveform,
+            *rest,
+            settled,
+            peak,
+            frequency(d.frequency, 3),
+        )
     return table
 
 
@@ -380,7 +359,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
-    >>> from malta.margins.loop_report import Outcome
+    >>> from malta.margins.outcome import Outcome
     >>> margin = Outcome("margin", 3.0, 3.6, "1", "proven over the travel", at_least=True)
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements
@@ -393,10 +372,8 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     """
     table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
-        ratio, verdict = "", ""
-        if r.asked is not None:
-            ratio, verdict = r.nearness, "FAILS" if r.verdict == "fails" else r.verdict
-        cells = [Text(cell) for cell in (r.words, r.asked_text, r.found_text, ratio, verdict, r.how)]
+        verdict = "" if r.asked is None else "FAILS" if r.verdict == "fails" else r.verdict
+        cells = [Text(cell) for cell in (r.words, r.asked_text, r.found_text, r.nearness, verdict, r.how)]
         cells[4].style = COLOURS[r.verdict]
         table.add_row(*cells)
     return table

@@ -14,7 +14,7 @@ from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from malta.margins.loop_report import zone
+from malta.display import quantity
 from malta.report.figures.drawing import Published
 from malta.report.tables import (
     COLOURS,
@@ -30,11 +30,14 @@ from malta.report.tables import (
 )
 from malta.simulation.experiments import Experiment, setting
 from malta.simulation.experiments.catalogue import experiments_of, options_of
+from malta.units import FINE_UNITS, unit_factor
 
 if TYPE_CHECKING:
     from malta.identification.commission import Check, Commissioning, StepFinding
     from malta.identification.excite import ExcitationPlan
-    from malta.identification.identify import Identified
+    from malta.identification.explanation import Explanation
+    from malta.identification.frequency_response import ResponseComparison
+    from malta.identification.identified import Identified
     from malta.identification.log import Log
     from malta.identification.measure import Measurement, MeasurementPlan
     from malta.identification.prediction import Predicted
@@ -120,11 +123,11 @@ def _merits_table(title: str, merits: Sequence[Merit], published: Published | No
 def _cases_table(e: Experiment, published: Published | None) -> Table:
     """One row for each case; one column for each case where there are more than COLUMNS figures of merit.
 
-    Where the cases have different figures of merit, the figures stand below each other.
+    Where the cases have different figures of merit, or one figure in other units, they stand below each other.
     """
     fullest = max((case.merits for case in e.cases), key=len)
-    labels = [merit.label for merit in fullest]
-    if any(merit.label not in labels for case in e.cases for merit in case.merits):
+    labels, headings = [merit.label for merit in fullest], {merit.heading for merit in fullest}
+    if any(merit.heading not in headings for case in e.cases for merit in case.merits):
         return _list_of_merits(e)
     if len(labels) > COLUMNS:
         return _transpose(e, fullest)
@@ -188,11 +191,11 @@ def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table
     >>> rich.print(malta.report.scenarios_table(ball, ["disturbance"]))
     Scenarios of the machine 'ball'
     <BLANKLINE>
-     scenario      what is run                                  options of its own
-     ─────────────────────────────────────────────────────────────────────────────
-     disturbance   A constant force or torque of `size` (N or   on=all
-                   N m) on one input of disturbance, or on      size=1.0
-                   each in turn.                                time=0.0
+     scenario      what is run                                   options of its own
+     ──────────────────────────────────────────────────────────────────────────────
+     disturbance   A constant load of `size` (SI; 0: 1, or       on=all
+                   what half of the way to a contact takes) on   size=0.0
+                   one disturbance, or on each.                  time=0.0
     <BLANKLINE>
     """
     table = new_table(
@@ -220,23 +223,34 @@ def _options(name: str, plant: Plant) -> list[str]:
 
 
 def micro(unit: str) -> tuple[float, str]:
-    """How lengths and angles of a machine are shown: what SI is multiplied with, and the unit."""
-    return (1e6, f"u{unit}") if unit in ("m", "rad") else (1.0, unit)
+    """How lengths, angles and voltages of a machine are shown: what SI is multiplied with, and the unit."""
+    fine = FINE_UNITS.get(unit, unit)
+    return (1 / unit_factor(fine, "unit"), fine) if fine != unit else (1.0, unit)
 
 
 def log_table(log: Log) -> Table:
     """Statistics of the columns of a log, lengths in um; a column that never changes has one number."""
     table = new_table("Signals", "signal", "least", "mean", "largest", "deviation")
+    for row in log_rows(log):
+        add_row(table, *row)
+    return table
+
+
+def log_rows(log: Log) -> list[tuple[str, ...]]:
+    """The rows of `log_table`."""
+    rows = []
     for heading, numbers in log.survey.statistics.items():
         name, unit = heading[:-1].rsplit(" [", 1)
         scale, shown = micro(unit)
         if not heading.startswith("flag."):
-            add_row(table, f"{name} [{shown}]", *(f"{scale * value:.4g}" for value in numbers))
-    return table
+            rows.append((f"{name} [{shown}]", *(f"{scale * value:.4g}" for value in numbers)))
+    return rows
 
 
 def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
     """What moves how far, what current flows, and what will be found how well."""
+    from malta.identification.response import axes_of  # loads an optimizer
+
     moved = new_table("What it does, by the linear loop", "signal", "largest", "of its limit")
     for signal in plant.outputs:
         scale, unit = micro(signal.unit)
@@ -245,11 +259,13 @@ def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
     for signal, limit in zip(plant.inputs, plant.actuator.force_limit, strict=True):
         share = plan.command[signal.name]
         add_row(moved, f"{signal.name} [{signal.unit}]", f"{share * limit:.4g}", f"{100 * share:.3g} %")
-    most = max(plan.current.values())
+    most, unit_of = max(plan.current.values()), {s.name: s.unit for s in axes_of(plant)}
     for name, value in plan.current.items():
         if value > 1e-6 * most:
             share = value / plant.actuator.current_limit
-            add_row(moved, f"{name} beside that at rest [A]", f"{value:.4g}", f"{100 * share:.3g} %")
+            add_row(
+                moved, f"{name} beside that at rest [{unit_of[name]}]", f"{value:.4g}", f"{100 * share:.3g} %"
+            )
     told = new_table("What its log will tell", "parameter", "half of the 95 % interval [%]")
     for name, share in plan.accuracy.items():
         add_row(told, name, f"{100 * share:.2g}")
@@ -257,18 +273,51 @@ def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
 
 
 def identified_table(found: Identified) -> Table:
-    """The identified parameters with their 95 % intervals."""
+    """The identified parameters with their total 95 % intervals, and those of noise alone."""
     from malta.identification.response import units_of_model  # loads an optimizer
 
-    table = new_table("Identified", "parameter", "value", "95 % interval", "half [%]", "gain file")
+    headings = ("parameter", "value", "95 % interval, total", "half [%]", "by noise alone", "gain file")
+    table = new_table("Identified", *headings)
     units = units_of_model(found.plant)
-    for name, value, half, start in zip(
-        found.names, found.values.tolist(), found.half_widths.tolist(), found.start.tolist(), strict=True
-    ):
+    columns = (found.values, found.total, found.half_widths, found.start)
+    for name, value, total, alone, start in zip(found.names, *(c.tolist() for c in columns), strict=True):
         unit = "" if units[name] == "1" else f" [{units[name]}]"
-        share = f"{100 * half / abs(value):.2g}" if value else "-"
-        ends = f"{value - half:.6g} .. {value + half:.6g}"
-        add_row(table, f"{name}{unit}", f"{value:.5g}", ends, share, f"{start:.5g}")
+        shares = [f"{100 * half / abs(value):.2g}" if value else "-" for half in (total, alone)]
+        ends = f"{value - total:.5g} .. {value + total:.5g}"
+        add_row(table, f"{name}{unit}", f"{value:.5g}", ends, *shares, f"{start:.5g}")
+    return table
+
+
+def explanation_table(e: Explanation) -> Table:
+    """What explains a log beside the parameters, and what does it as well."""
+    table = new_table(
+        "What explains the log beside them", "imperfection", "found", "usual", "share [%]", "or"
+    )
+    for one in e.causes:
+        usual = quantity(1.96 * abs(one.size), one.unit)
+        found = f"{quantity(one.value, one.unit)} +- {quantity(one.half, one.unit)}"
+        more = " ..." if len(one.alike) > 2 else ""
+        add_row(
+            table, one.name, found, f"+- {usual}", f"{100 * one.share:.2g}", " ".join(one.alike[:2]) + more
+        )
+    return table
+
+
+KNOWN_ROWS = 12  # of a table of what is known
+MIN_EFFECT = 1e-3  # of a parameter: what moves none by more is not listed
+
+
+def known_table(e: Explanation) -> Table:
+    """What was taken as known, how well, and what it moves: 1 % of it, of what is zero as much as the log leaves."""
+    table = new_table("Taken as known, and what it moves", "known", "value, 95 %", "so much of it", "moves")
+    for one in sorted(e.effects, key=lambda one: not one.value)[:KNOWN_ROWS]:
+        share = 0.01 * abs(one.value) / one.left if one.value else 1.0
+        moved = {name: x * share for name, x in one.effect.items() if abs(x) * share > MIN_EFFECT}
+        most = sorted(moved, key=lambda name: -abs(moved[name]))[:3]
+        text = ", ".join(f"{name} {100 * x:+.2g} %" for name, x in moved.items() if name in most)
+        if text:
+            value = f"{quantity(one.value, one.unit)} +- {quantity(1.96 * one.size, one.unit)}"
+            add_row(table, one.name, value, "1 %" if one.value else quantity(one.left, one.unit), text)
     return table
 
 
@@ -302,9 +351,19 @@ def drive_table(found: Windings) -> Table:
 def quality_table(found: Identified) -> Table:
     """How well the model explains the log."""
     table = new_table("How well the model explains the log", "figure", "found", "if it is right")
+    if found.record is not None:
+        for signal, size in zip(found.plant.outputs, found.record.noise.sensors.tolist(), strict=True):
+            add_row(table, f"noise of {signal.name}, rms", quantity(math.sqrt(size), signal.unit), "")
+        add_row(
+            table, "largest correlation of prediction errors", f"{found.record.correlation:.2g}", "below 0.15"
+        )
+        return table
     add_row(table, f"chi2 / dof, {found.dof} degrees", f"{found.chi2:.3g}", f"1, at most {found.limit:.3g}")
     for name, value in found.by_output.items():
         add_row(table, f"of {name}", f"{value:.3g}", "1")
+    if found.explanation is not None and found.chi2 > found.limit:
+        add_row(table, "chi2 / dof with imperfections", f"{found.explanation.chi2:.3g}", "1")
+        add_row(table, "response that is left [%]", f"{100 * found.explanation.share:.2g}", "0")
     add_row(table, "correlation of neighbouring lines [sigma]", f"{found.whiteness:.2g}", "-2 .. 2")
     add_row(table, "power where nothing was excited", f"{found.distortion:.3g}", "1")
     return table
@@ -335,8 +394,21 @@ def replay_table(found: LawReplay, plant: Plant) -> Table:
     return table
 
 
+def response_table(found: ResponseComparison) -> Table:
+    """A response of an analyser beside what is predicted, where it is largest, and where it misses most."""
+    size, heads = np.abs(found.response.values), ("where", "at [Hz]", "measured", "predicted", "error [%]")
+    table = new_table(f"{found.of}: measured beside predicted", *heads)
+    for where, k in (("largest", int(size.argmax())), ("misses most", int(found.error.argmax()))):
+        tube = f"{found.low[k]:.3g} .. {found.high[k]:.3g}" if found.machines > 1 else f"{found.high[k]:.3g}"
+        at = f"{found.response.w[k] / (2 * np.pi):.4g}"
+        add_row(table, where, at, f"{size[k]:.3g}", tube, f"{100 * found.error[k]:.2g}")
+    return table
+
+
 def measured_tables(found: Measurement) -> list[Table]:
     """The largest |S| and |T| of each sensor as measured, with bands, and disk margins, beside what is predicted."""
+    from malta.margins.loop_report import zone  # here: it brings all proofs
+
     table = new_table(
         "The loop as measured, at the lines",
         "sensor", "largest |S|", "at [Hz]", "95 % below", "zone", "predicted", "largest |T|", "predicted",

@@ -10,8 +10,9 @@ from rich.table import Table
 
 from malta.arguments import is_number
 from malta.bound import at_least, at_most
-from malta.display import RADIANS, frequency
+from malta.display import RADIANS, frequency, number
 from malta.margins.loop_report import LoopReport, zone
+from malta.margins.outcome import near_limits
 from malta.model.parameters import box_words
 from malta.model.signal_groups import axis_units
 from malta.proof.margin import NOT_PROVEN, Margin, unproven
@@ -27,6 +28,7 @@ from malta.report.tables.design import (
 if TYPE_CHECKING:
     from malta.loops.classical import Disk
     from malta.margins.travel import Extent
+    from malta.margins.unmodelled import UnmodelledMargin
     from malta.proof.blocks.gain import Gain
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
@@ -66,6 +68,8 @@ def loop_tables(
         yield from _margin_tables(found)
     if found.worst:
         yield worst_case_table(found.worst)
+    if found.unmodelled is not None:
+        yield Paragraph(unmodelled_text(found.unmodelled) + "\n")
     if spec is not None:
         yield from _requirements(found, spec)
 
@@ -93,10 +97,8 @@ def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
     failed = [one for one in asked if not one.holds]
     if failed:
         yield requirements_table(failed)
-    held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
-    near = ", ".join(f"{one.name.replace('_', ' ')} {one.nearness}" for one in held[:SHOWN_NEAR_LIMITS])
-    text = f"Requirements of {spec.path}: {len(held)} of {len(asked)} hold"
-    if held:
+    text = f"Requirements of {spec.path}: {len(asked) - len(failed)} of {len(asked)} hold"
+    if near := near_limits(asked, SHOWN_NEAR_LIMITS):
         text += f"; nearest their limits {near}"
     judged = {one.name for one in found.requirements}
     others = [name.replace("_", " ") for name in spec.specification if name not in judged]
@@ -277,7 +279,8 @@ def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
     """A delay margin (s) as time and in samples."""
     if math.isnan(delay):
         return "unstable", ""
-    return (f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples") if math.isfinite(delay) else ("any", "")
+    text = f"{delay * 1e6:.0f} us" if delay < 0.1 else f"{delay:.3g} s"
+    return (text, f"{delay / Ts:.1f} samples") if math.isfinite(delay) else ("any", "")
 
 
 def gang_table(found: LoopReport) -> Table:
@@ -296,23 +299,25 @@ def gang_table(found: LoopReport) -> Table:
     <BLANKLINE>
      sensor    |S|    |T|   from force |SP| [µm/N]   to force |FS| [N/µm]
      ────────────────────────────────────────────────────────────────────
-     y        1.57   1.72                    430.5                  0.034
+     y        1.57   1.72                    430.5                0.03437
     <BLANKLINE>
     """
     outputs, forces_of = found.plant.outputs, found.plant.inputs
     last = len(forces_of) - 1
     units = {s.name: axis_units(s.unit, forces_of[min(k, last)].unit) for k, s in enumerate(outputs)}
-    one = next(iter(units.values())) if len(set(units.values())) == 1 else None
-    heads = (f" [{unit}]" for unit in one[:2]) if one else ("", "")
+    same = next(iter(units.values())) if len(set(units.values())) == 1 else None
+    heads = (f" [{unit}]" for unit in same[:2]) if same else ("", "")
     extent = found.extent
     title = f"Gang of four, largest over frequency{f' and {_course_text(extent)}' if extent.course else ''}"
     forces = (f"{what}{unit}" for what, unit in zip(("from force |SP|", "to force |FS|"), heads, strict=True))
     table = new_table(title, "sensor", "|S|", "|T|", *forces)
     for name, (S, T, PS, FS) in found.gang.items():
         unit = units[name]
-        cells = (f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}") if unit.micro else (f"{PS:.4g}", f"{FS:.4g}")
-        if not one:
-            cells = f"{cells[0]} {unit.compliance}", f"{cells[1]} {unit.stiffness}"
+        scale = 1e6 if unit.micro else 1.0
+        cells = number(scale * PS), number(FS / scale)
+        if not same:
+            over, under = ("" if of == "1" else f" {of}" for of in unit[:2])
+            cells = f"{cells[0]}{over}", f"{cells[1]}{under}"
         add_row(table, name, f"{S:.2f}", f"{T:.2f}", *cells)
     return table
 
@@ -412,6 +417,21 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
         worse = " or worse" if gain.upper is None and reached != zone(math.inf) else ""
         add_row(table, name, found, at, proven, reached + worse)
     return table
+
+
+def unmodelled_text(found: UnmodelledMargin) -> str:
+    """Say how large the margin with unmodelled dynamics is, what W is, and what is assumed.
+
+    found : of a LoopReport, `unmodelled`
+    """
+    sizes = ", ".join(
+        f"{at_most(size).percent()} at {w / (2 * math.pi):.4g} Hz" for w, size in found.sizes.items()
+    )
+    return (
+        f"Unmodelled dynamics: {found.verdict}. Margin of parameters and of W together: {found.margin}; the box of "
+        f"all parameters needs {at_most(found.needed).percent()}. |W|, of order {found.order}: {sizes}. "
+        f"Assumed: {found.assumed}."
+    )
 
 
 def places_table(found: LoopReport) -> Table:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
-from malta.model.plant import Plant
+from malta.model.plant import Plant, given_plant
 from malta.model.plants import plant_of
 from malta.simulation.divergence import rooms_of
 from malta.simulation.engine.compiled import LANES, feedforward_table
@@ -36,7 +36,7 @@ from malta.simulation.engine.digest import (
     restart,
     verdicts,
 )
-from malta.simulation.engine.engines import BLOCK, EngineChoice, engine_text, evaluate, library_of, shape_of
+from malta.simulation.engine.engines import BLOCK, EngineChoice, engine_key, evaluate, library_of, shape_of
 from malta.simulation.engine.lanes import (
     Lanes,
     Shared,
@@ -51,10 +51,11 @@ from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.period import initial_state, period_of
 from malta.simulation.readings import NOISE_SAMPLES_AT_ONCE, advance_keys, keys, starts_of_parts
-from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
+from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of
 from malta.simulation.simulate import EngineOf, simulate
+from malta.simulation.steps import steps_of
 from malta.simulation.trajectory import Trajectory, trajectory_of
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
 
 # Groups of machines on several threads: each takes the next call of the engine until none is left.
 
@@ -161,6 +162,8 @@ def simulate_many(
     >>> [f"{1e3 * rise:.1f} ms" for rise in batch.rise]
     ['14.5 ms', '15.6 ms', '16.5 ms']
     """
+    controller = given_law("simulate_many", controller)
+    plant = given_plant("simulate_many", plant)
     for name in ("faults", "changes", "correction"):
         if getattr(scenario, name):
             raise InputError(scenario.where, name, "some", "none in a campaign")
@@ -177,17 +180,18 @@ def simulate_many(
     compiled = library_of(shape, LANES, digest_function(shape), cruise_functions(shape))
     if compiled is None:
         return _simulate_one_by_one(alone, variation, progress)
-    inputs, shared, lanes, parts = _prepare(simulation, variation)
+    count = steps_of(alone.plant, controller, scenario)  # whatever the others of a batch are
+    inputs, shared, lanes, parts = _prepare(simulation, variation, count)
     rooms = rooms_of(alone, inputs)
     digest, sizes = first_digest(plant, inputs.motion.p, rooms), digest_sizes(plant)
     groups, runs = len(lanes.states), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
-    shared = shared._replace(foreseen=foresee_samples(compiled[0], lanes, shared))
+    shared = shared._replace(foreseen=foresee_samples(compiled, lanes, shared))
     settled = scenario.settling_samples(controller.sample_time)
     if settled:
         sensors = lanes.sigma.shape[1]
         parts = _split(parts, settled, sensors, partial(restart, first=digest, sizes=sizes))
-    run_groups(compiled[0], LaneWork(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
+    run_groups(compiled, LaneWork(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
     return batch_of(ends, len(inputs.t), controller.sample_time, sizes, settled)
 
@@ -203,11 +207,14 @@ class Variation(NamedTuple):
 
 
 def _prepare(
-    simulation: Simulation, variation: Variation
+    simulation: Simulation, variation: Variation, count: int
 ) -> tuple[Inputs, Shared, Lanes, Sequence[TimeSpan]]:
-    """Inputs that all machines share, each machine's own numbers in lanes, still without digests, and the noise."""
+    """Inputs that all machines share, each machine's own numbers in lanes, still without digests, and the noise.
+
+    count : Runge-Kutta steps in a sample
+    """
     plant, controller, scenario, setup = simulation
-    count, runs = steps_of(plant, controller, scenario), variation.runs
+    runs = variation.runs
     values = numbers_of(plant, controller, count, scenario.sensor_errors)
     same, own = flatten(values), _own_numbers(plant, values, variation)
     inputs = inputs_of(simulation)
@@ -285,14 +292,14 @@ def record_run(
     if noise is not None:
         noise = noise[begin - first : begin - first + LANES]
         own_scenario = replace(own_scenario, run=tuple(noise[index - begin].tolist()))
-    plant = with_varied(plant, changes)
+    count, plant = steps_of(plant, controller, scenario), with_varied(plant, changes)
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     shape = shape_of(plant, controller, simulation.setup)
     compiled = library_of(shape, LANES, recorder_function(shape))
     if compiled is None:
         return None
     variation = _variation(plant, group, errors, None, begin, noise)
-    inputs, shared, lanes, parts = _prepare(simulation, variation)
+    inputs, shared, lanes, parts = _prepare(simulation, variation, count)
     width = sum(layout_of(plant, controller, simulation.setup).row.values())
     rows = np.empty((len(inputs.t), width))
     last = np.zeros((1, NOISE_SAMPLES_AT_ONCE * width, LANES))
@@ -301,7 +308,7 @@ def record_run(
         for k in range(samples.start, samples.stop, NOISE_SAMPLES_AT_ONCE):
             given = inputs.given[k : min(k + NOISE_SAMPLES_AT_ONCE, samples.stop)]
             now = lanes._replace(keys=advance_keys(streams, k - samples.start, sensors), digests=last)
-            run_many(compiled[0], slice(0, 1), now, shared._replace(given=given))
+            run_many(compiled, slice(0, 1), now, shared._replace(given=given))
             rows[k : k + len(given)] = last[0, :, index - begin].reshape(NOISE_SAMPLES_AT_ONCE, width)[
                 -len(given) :
             ]
@@ -365,10 +372,10 @@ def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> boo
 
 
 def functions_text(plant: Plant, controller: Controller, scenario: Scenario) -> str:
-    """The functions that `simulate_many` runs as text: in C, or as CasADi stores those that have no form in C."""
+    """What decides the functions that `simulate_many` runs: of those without a form in C, themselves."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
     if not plant_of(controller.parameters).actuator.tabulated:
-        return engine_text(shape, digest_function(shape), cruise_functions(shape))
+        return engine_key(shape, digest_function(shape), cruise_functions(shape))
     period = period_of(plant, controller, shape.setup, numbers_of(plant, controller, 1), constant=True)
     return "\n".join(f.serialize() for f in (period.sense, period.decide, period.substep))
 

@@ -19,7 +19,7 @@ import signal
 import stat
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -202,15 +202,24 @@ def _answer(command: list[str], seconds: float | None = None) -> tuple[int, str]
 
 
 def library(
-    text: str, lanes: int, folder: Path | None = None, flags: tuple[str, ...] | None = None
+    text: str | Callable[[], str],
+    lanes: int,
+    folder: Path | None = None,
+    flags: tuple[str, ...] | None = None,
+    key: str = "",
 ) -> ctypes.CDLL | None:
-    """The library of a C text, from the cache folder or compiled now; None where no compiler can make it."""
+    """The library of a C text, from the cache folder or compiled now; None where no compiler can make it.
+
+    text : a function makes it where no library with this key is kept
+    key : that decides the text; "": the text itself
+    """
     cc = compiler()
     version = None if cc is None else _version(cc)
     if cc is None or version is None:
         return None
     flags = FLAGS if flags is None else flags
-    key = "\n".join([text, str(lanes), *flags, *TARGET, *cc, version, _processor(), platform.platform()])
+    decides = key or (text if isinstance(text, str) else text())
+    key = "\n".join([decides, str(lanes), *flags, *TARGET, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for wanted in (folder or cache_folder(), _temporary_folder(), None):
         try:
@@ -219,7 +228,7 @@ def library(
                 continue
             path = place / name
             sound = is_private(path) and _is_intact(path)
-            if not sound and not _compile(cc, text, lanes, path, flags):
+            if not sound and not _compile(cc, text if isinstance(text, str) else text(), lanes, path, flags):
                 return None
             return ctypes.CDLL(str(path))
         except OSError:

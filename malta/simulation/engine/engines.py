@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
+from importlib import import_module
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -34,7 +36,15 @@ from malta.simulation.engine.instructions import (
     read_instructions,
 )
 from malta.simulation.engine.integration_state import with_working_state
-from malta.simulation.layout import SHARED_NUMBERS, Setup, electronics_of, ending_columns, flatten, numbers_of
+from malta.simulation.layout import (
+    SHARED_NUMBERS,
+    Setup,
+    electronics_of,
+    ending_columns,
+    flatten,
+    layout_of,
+    numbers_of,
+)
 from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
 from malta.synthesis.controller import Controller
 from malta.synthesis.law import gains_of
@@ -290,13 +300,12 @@ def engine_of(
     """
     values = numbers_of(plant, c, substeps, dict(errors))
     if choice != "virtual machine":
-        found = library_of(shape_of(plant, c, setup))
-        if found is not None:
-            lib, p = found
-            ff = c.feedforward
+        lib = library_of(shape_of(plant, c, setup))
+        if lib is not None:
+            ff, width = c.feedforward, sum(layout_of(plant, c, setup).row.values())
             table = feedforward_table(ff.z_grid, ff.v0)
             return compiled_engine(
-                lib.run, p, flatten(values), substeps, table, ending_columns(plant, c, setup)
+                lib.run, width, flatten(values), substeps, table, ending_columns(plant, c, setup)
             )
         if choice == "compiled":
             if plant_of(c.parameters).actuator.tabulated:
@@ -337,24 +346,52 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> LoopShape:
 @lru_cache(maxsize=32)
 def library_of(
     shape: LoopShape, lanes: int = 1, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
-) -> tuple[Any, Period] | None:
-    """The library and the functions of a shape; None where it cannot be compiled.
+) -> Any:
+    """The library of a shape; None where it cannot be compiled.
 
     digest : the function that updates a run's digest; for several lanes
     cruise : see digest.cruise_functions
     """
     if plant_of(shape.controller.parameters).actuator.tabulated:
         return None
-    lib = library(engine_text(shape, digest, cruise), lanes)
-    return None if lib is None else (lib, compiled_period(shape))
+    text = partial(engine_text, shape, digest, cruise)
+    return library(text, lanes, key=engine_key(shape, digest, cruise))
 
 
-@lru_cache(maxsize=32)
 def engine_text(
     shape: LoopShape, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
 ) -> str:
     """The C text of a shape's engine; digest and cruise as in `library_of`."""
     return source(compiled_period(shape), digest, cruise)
+
+
+@lru_cache(maxsize=32)
+def engine_key(
+    shape: LoopShape, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
+) -> str:
+    """What decides an engine's C text, which takes ten times as long to make: its functions as they are first written,
+    with all that a machine's module may have read from elsewhere, and malta's modules that make text of them."""
+    plant, c, s = shape.plant, shape.controller, shape.setup
+    numbers = numbers_of(plant, c, 1)
+    p = period_of(plant, c, s, numbers, constant=False, shorten=lambda expressions: expressions)
+    functions = (p.sense, p.decide, p.substep, *([digest] if digest else []), *cruise)
+    rest = (p.theta, columns_of(c), s.fidelity, s.fraction, plant.second_order)
+    parts = [_translators(), repr(rest).encode(), *(f.serialize().encode() for f in functions)]
+    return hashlib.sha256(b"\n".join(parts)).hexdigest()
+
+
+@cache
+def _translators() -> bytes:
+    """The modules that make an engine's text, as they are: sources or compiled, in a folder or a zip."""
+    names = ("engines", "instructions", "integration_state")
+    modules: list[Any] = [import_module(f"malta.simulation.engine.{name}") for name in names]
+    texts = ("engine.c", "noise.c", "numbers.c")
+    return b"".join(
+        [
+            *(module.__loader__.get_data(module.__file__) for module in modules),
+            *(read_packaged(f"simulation/engine/{name}") for name in texts),
+        ]
+    )
 
 
 @lru_cache(maxsize=32)
@@ -372,13 +409,13 @@ def substeps_until(sample: int, substeps: float) -> int:
 
 
 def compiled_engine(
-    run: Any, p: Period, theta: FloatArray, substeps: float, table: FloatArray, ending: Sequence[int] = ()
+    run: Any, width: int, theta: FloatArray, substeps: float, table: FloatArray, ending: Sequence[int] = ()
 ) -> Engine:
     """The engine of a library with one lane; `run` is the library's function.
 
+    width : of a row
     ending : columns of a row that end a run, see ending_columns; rows after such a row are not computed
     """
-    width = p.decide.size1_out(2)
     ends, columns = ctypes.c_long(len(ending)), (ctypes.c_long * len(ending))(*ending)
     theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))
     numbers, points, rows_of_table = (  # these addresses keep their arrays alive

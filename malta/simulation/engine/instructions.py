@@ -19,11 +19,15 @@ from malta.errors import CheckError
 
 _BINARY_SIGNS = {"ADD": "+", "SUB": "-", "MUL": "*"}
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
-_MATH = ["sqrt", "floor", "ceil", "exp", "log", "tan", "tanh", "asin", "acos", "atan", "sinh", "cosh", "sign"]
+_MATH = (
+    *("sqrt", "floor", "ceil", "exp", "log", "tan", "tanh", "asin", "acos", "atan", "sinh", "cosh", "sign"),
+    *("asinh", "acosh", "atanh", "erf", "expm1", "log1p"),
+)
+_MATH_OF_TWO = ("pow", "atan2", "hypot", "fmod", "remainder", "copysign")
 _FORMS = (
     {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY_SIGNS.items()}
     | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _MATH}
-    | {f"OP_{name.upper()}": f"each_{name}({{0}}, {{1}})" for name in ("pow", "atan2", "hypot", "fmod")}
+    | {f"OP_{name.upper()}": f"each_{name}({{0}}, {{1}})" for name in _MATH_OF_TWO}
     | {
         "OP_ASSIGN": "{0}",
         "OP_NEG": "-{0}",

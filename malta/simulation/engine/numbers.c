@@ -67,7 +67,10 @@ EACH(inline, each_sign, one_sign)
 EACH(APART, each_exp, exp) EACH(APART, each_log, log) EACH(APART, each_tan, tan) EACH(APART, each_tanh, tanh)
 EACH(APART, each_asin, asin) EACH(APART, each_acos, acos) EACH(APART, each_atan, atan) EACH(APART, each_sinh, sinh)
 EACH(APART, each_cosh, cosh) EACH(APART, each_uniform, one_uniform)
+EACH(APART, each_asinh, asinh) EACH(APART, each_acosh, acosh) EACH(APART, each_atanh, atanh) EACH(APART, each_erf, erf)
+EACH(APART, each_expm1, expm1) EACH(APART, each_log1p, log1p)
 PAIR(each_pow, pow) PAIR(each_atan2, atan2) PAIR(each_hypot, hypot) PAIR(each_fmod, fmod)
+PAIR(each_remainder, remainder) PAIR(each_copysign, copysign)
 
 #if LANES == 8 && defined(__AVX512DQ__)
 static inline int nowhere(whole m) { return _mm512_movepi64_mask((__m512i)m) == 0; }

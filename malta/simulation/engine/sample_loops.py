@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -28,11 +28,25 @@ void run(long count, const casadi_real *given, const casadi_real *numbers, casad
   }}
 }}
 """
-Loop = Callable[[FloatArray, Sequence[FloatArray], FloatArray], FloatArray]
-"""(first state, tables of inputs with a line for each sample, numbers) -> rows, a line for each sample."""
 
 
-def loop_of(x: Any, given: Any, numbers: Any, after: Any, row: Any) -> Loop:
+class SampleLoop(Protocol):
+    """(first state, tables of inputs with a line for each sample, numbers) -> rows, a line for each sample.
+
+    `last` becomes the state behind the last sample, from which other samples may go on.
+    """
+
+    def __call__(
+        self,
+        first: FloatArray,
+        tables: Sequence[FloatArray],
+        constants: FloatArray,
+        last: FloatArray | None = None,
+    ) -> FloatArray:
+        """Run through the samples."""
+
+
+def loop_of(x: Any, given: Any, numbers: Any, after: Any, row: Any) -> SampleLoop:
     """The loop over samples of x_k+1 = after(x_k, given_k, numbers), with row(x_k, given_k, numbers) of each sample.
 
     All are columns of CasADi's SX: three of symbols, two expressions of them. The tables of a call stand side by side
@@ -57,9 +71,11 @@ def loop_of(x: Any, given: Any, numbers: Any, after: Any, row: Any) -> Loop:
             compiled.run(ctypes.c_long(len(rows)), *addresses)
             return
         states, found = evaluate(chain, state, block, np.tile(constants, (SAMPLES_AT_ONCE, 1)))
-        rows[:], state[:] = found[: len(rows)], states[-1]
+        rows[:], state[:] = found[: len(rows)], states[len(rows) - 1]
 
-    def loop(first: FloatArray, tables: Sequence[FloatArray], constants: FloatArray) -> FloatArray:
+    def loop(
+        first: FloatArray, tables: Sequence[FloatArray], constants: FloatArray, last: FloatArray | None = None
+    ) -> FloatArray:
         state, constants = np.array(first, dtype=float), np.ascontiguousarray(constants, dtype=float)
         rows = np.empty((len(tables[0]), row.numel()))
         block = np.zeros((SAMPLES_AT_ONCE, given.numel()))
@@ -69,6 +85,8 @@ def loop_of(x: Any, given: Any, numbers: Any, after: Any, row: Any) -> Loop:
                 [table[k : k + SAMPLES_AT_ONCE] for table in tables], axis=1, out=block[: len(part)]
             )
             fill(state, block, constants, part)
+        if last is not None:
+            last[:] = state
         return rows
 
     return loop

@@ -20,17 +20,19 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.loops.loop import loop_along
+from malta.interrupts import watch_interrupts
 from malta.merits import Merit as Merit, figure
 from malta.model.linearize import linearize
 from malta.model.parts import attribute_of
-from malta.model.plant import Plant
+from malta.model.plant import Plant, Signal
 from malta.simulation.inputs import MAX_SAMPLES
+from malta.simulation.layout import fidelities
 from malta.simulation.references import Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
+from malta.work import cut_error, is_stopped
 
 Progress = Callable[[float], None]
 
@@ -65,7 +67,7 @@ class Experiment:
     cases : runs, each with its label, its Trajectory and its figures of merit
     merits : figures of merit of the experiment as a whole, in SI, with a unit for display
     curves : arrays that are drawn beside the runs
-    interrupted : whether Ctrl-C ended the experiment; it has the cases up to then
+    interrupted : whether Ctrl-C, or the end of its time, ended the experiment; it has the cases up to then
     controller : a controller that the experiment has found, for a gain file; None: none
 
     >>> import malta
@@ -105,7 +107,7 @@ class Experiment:
 
     @property
     def cut(self) -> bool:
-        """Whether Ctrl-C ended the experiment or its last run: no figure is final."""
+        """Whether Ctrl-C or the clock ended the experiment or its last run: no figure is final."""
         return self.interrupted or any(case.run.verdict.name == "interrupted" for case in self.cases)
 
     @property
@@ -152,6 +154,26 @@ def scenario_of(
     return replace(Scenario(name, duration, reference), **fields)
 
 
+def with_fidelity(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options with the default fidelity: "dq" for machines with windings, else "force"."""
+    return {"fidelity": "dq" if "dq" in fidelities(plant) else "force"} | dict(options)
+
+
+def with_exact_sensors(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options with sensors that have no noise and no steps, where they do not say otherwise."""
+    return {"noise": 0.0, "quantize": False} | dict(options)
+
+
+def choose_signals(signals: Sequence[Signal], name: str, option: str) -> list[int]:
+    """The index of a signal, or all indices for "all". Raises InputError for an unknown name."""
+    names = [s.name for s in signals]
+    if name == "all":
+        return list(range(len(names)))
+    if name not in names:
+        raise InputError("simulate", option, repr(name), "all, or one of " + " ".join(names))
+    return [names.index(name)]
+
+
 def fly(
     plant: Plant,
     controller: Controller,
@@ -159,7 +181,7 @@ def fly(
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
-    """Simulate runs one after the other: the cases, and whether Ctrl-C ended the series before its last run."""
+    """Simulate runs one after the other: the cases, and whether Ctrl-C or the clock ended the series before its end."""
     return fly_all([(plant, controller, one) for one in planned], progress, options)
 
 
@@ -175,9 +197,14 @@ def fly_all(
         where, found = (flights[0][2].scenario.where, f"{len(flights)} of {samples:.4g} samples in all")
         raise InputError(where, "runs", found, f"at most {MAX_SAMPLES} samples")
     for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
-        share = progress_of_part(progress, n, len(flights))
+        share = end_in_time(progress_of_part(progress, n, len(flights)))
+        if cases and is_stopped():
+            return tuple(cases), True
         try:
-            run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
+            with watch_interrupts():
+                run = simulate(
+                    plant, controller, scenario, engine=options.get("engine", "auto"), progress=share
+                )
         except KeyboardInterrupt:
             if not cases:
                 raise
@@ -214,6 +241,25 @@ def merits_of_first(cases: Sequence[Case]) -> tuple[Merit, ...]:
     return cases[0].merits
 
 
+def end_in_time(progress: Progress | None) -> Progress:
+    """The progress function of a run that ends as by Ctrl-C where the clock ended the question that it is part of."""
+
+    def report(share: float) -> None:
+        if progress is not None:
+            progress(share)
+        if share < 1 and is_stopped():
+            raise KeyboardInterrupt
+
+    return report
+
+
+def whole_experiment(found: Experiment) -> Experiment:
+    """An experiment that was not cut short. Raises WorkUp where the clock ended it, KeyboardInterrupt after Ctrl-C."""
+    if found.cut:
+        raise cut_error()
+    return found
+
+
 def progress_of_part(progress: Progress | None, n: int, total: int) -> Progress | None:
     """The progress function of part n of `total` equal parts."""
     return None if progress is None else lambda share: progress((n + share) / total)
@@ -239,6 +285,8 @@ def compliance(
 
     S is the sampled loop's sensitivity at the sensors, G_w the open machine's response to the force between samples.
     """
+    from malta.loops.loop import loop_along  # here: most experiments need no linear loop
+
     point = plant.point(controller.operating_point[0])
     model = linearize(plant, point)
     loop = loop_along(plant, controller)

@@ -26,7 +26,7 @@ and, where they differ from the defaults,
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import partial
 from numbers import Real
@@ -36,9 +36,13 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.errors import InputError
-from malta.model.places import place_states
-from malta.model.plant import Plant, Signal
+from malta.display import quantity
+from malta.errors import CheckError, InputError
+from malta.model.parts import INSTALL_PAPERS, has_papers, parts_of
+from malta.model.places import holdable_outputs, place_states
+from malta.model.plant import Plant, given_plant
+from malta.model.plants import plant_of
+from malta.model.printed import published_figures
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -47,6 +51,7 @@ from malta.simulation.experiments import (
     Merit,
     PlannedRun,
     Progress,
+    choose_signals,
     experiment_of,
     fly,
     merits_of_first,
@@ -54,13 +59,15 @@ from malta.simulation.experiments import (
     scenario_of,
     setting,
     step_wrench,
+    with_exact_sensors,
+    with_fidelity,
 )
-from malta.simulation.layout import fidelities
+from malta.simulation.experiments.worst_load import LOAD_SHARE, WORST_LOAD, worst_load_cases
 from malta.simulation.references import Motion, Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import EngineOf
 from malta.simulation.trajectory import Trajectory
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, given_law
 from malta.units import FINE_UNITS
 
 # Experiments of any machine: hold still, step an output, push.
@@ -68,8 +75,9 @@ from malta.units import FINE_UNITS
 # hold         motion and commands at rest, with sensors as built
 # step         a step of one output after the other
 # disturbance  a constant force or torque on each input of disturbance in turn
+# worst-load   the load of bounded size whose waveform moves one signal furthest; any machine on which loads act has it
 #
-# A machine that defines no experiments has these. Their options are in SI.
+# A machine that defines no experiments has all of these. Their options are in SI.
 
 
 SAMPLES = 2000  # of a run without a `time`
@@ -97,14 +105,19 @@ def step_cases(
     time: float = 0.0,
     **options: Any,
 ) -> list[PlannedRun]:
-    """A step of one output, or of each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors."""
-    duration, planned = _duration(controller, time), []
-    for k in _choose(plant.outputs, output, "output"):
+    """A step of one output, or of each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors.
+
+    Raises InputError for an output that no machine at rest is at, as an acceleration.
+    """
+    duration, planned, held = _duration(controller, time), list[PlannedRun](), holdable_outputs(plant)
+    for k in choose_signals(plant.outputs, output, "output") if output != "all" else held:
+        if k not in held:
+            names = " ".join(plant.outputs[j].name for j in held)
+            found = f"{output}, which no constant holds at rest"
+            raise InputError("simulate", "output", found, f"all, or one of {names}")
         signal, distance = plant.outputs[k], size or default_step(plant, k)
         reference = partial(jump, output=k, size=distance, at=LEAD_SHARE * duration)
-        scenario = scenario_of(
-            "step", duration, reference, _with_exact_sensors(with_fidelity(plant, options))
-        )
+        scenario = scenario_of("step", duration, reference, with_exact_sensors(with_fidelity(plant, options)))
         planned.append(PlannedRun(signal.name, scenario, partial(_step_merits, output=k, size=distance)))
     return planned
 
@@ -114,24 +127,26 @@ def disturbance_cases(
     controller: Controller,
     *,
     on: str = "all",
-    size: float = 1.0,
+    size: float = 0.0,
     time: float = 0.0,
     **options: Any,
 ) -> list[PlannedRun]:
-    """A constant force or torque of `size` (N or N m) on one input of disturbance, or on each in turn.
+    """A constant load of `size` (SI; 0: 1, or what half of the way to a contact takes) on one disturbance, or on each.
 
     Raises InputError for a machine without inputs of disturbance.
     """
     if not plant.disturbances:
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     duration, planned = _duration(controller, time), []
-    for k in _choose(plant.disturbances, on, "on"):
+    for k in choose_signals(plant.disturbances, on, "on"):
+        load, signal = size or default_load(controller, k), plant.disturbances[k]
         push = partial(
-            step_wrench, column=k, size=size, at=LEAD_SHARE * duration, width=len(plant.disturbances)
+            step_wrench, column=k, size=load, at=LEAD_SHARE * duration, width=len(plant.disturbances)
         )
-        given = _with_exact_sensors(with_fidelity(plant, options)) | {"disturbance": push}
+        given = with_exact_sensors(with_fidelity(plant, options)) | {"disturbance": push}
         scenario = scenario_of("disturbance", duration, references.hold, given)
-        planned.append(PlannedRun(plant.disturbances[k].name, scenario, _load_merits))
+        label = signal.name if size or load == 1 else f"{signal.name} of {quantity(load, signal.unit)}"
+        planned.append(PlannedRun(label, scenario, _load_merits))
     return planned
 
 
@@ -147,39 +162,44 @@ def jump(plant: Plant, output: int, size: float, at: float) -> Reference:
 
 
 def default_step(plant: Plant, output: int) -> float:
-    """A tenth of the clearance of an output, SI; without contacts, ten times the sensor's noise."""
-    y = np.zeros(len(plant.outputs))
-    probe = max(10 * plant.sensors.noise[output], SIZE)
-    y[output] = probe
-    if plant.contacts.names:
-        x = place_states(plant, ca.DM(plant.position_of(ca.DM(y))))
-        used = float(np.max(np.array(ca.DM(plant.contacts.contact(x)))))
-        if used > 0:
-            return probe * CLEARANCE / used
-    return probe
+    """A tenth of the clearance of an output, SI, or of what its sensor reads; without either, ten times its noise."""
+    touch, end = _rooms(plant, output)
+    return float(min(_probe(plant, output) if np.isinf(touch) else CLEARANCE * touch, CLEARANCE * end))
 
 
-def _choose(signals: Sequence[Signal], name: str, option: str) -> list[int]:
-    """The index of a signal, or all indices for "all". Raises InputError for an unknown name."""
-    names = [s.name for s in signals]
-    if name == "all":
-        return list(range(len(names)))
-    if name not in names:
-        raise InputError("simulate", option, repr(name), "all, or one of " + " ".join(names))
-    return [names.index(name)]
+def default_load(controller: Controller, disturbance: int) -> float:
+    """1 SI, or less where that moves an output more than half of the way to a contact or to its sensor's end.
+
+    By the linear loop of the gain file's machine, so that all machines of a campaign are pushed alike.
+    """
+    from malta.loops.loop import loop_along  # here: most experiments need no linear loop
+
+    plant = plant_of(controller.parameters)
+    try:
+        moved = loop_along(plant, controller).sampled.answer(disturbance).largest[:, 0]
+    except CheckError:  # an unstable loop
+        return 1.0
+    used = max(x / min(_rooms(plant, k)) for k, x in enumerate(moved.tolist()))
+    return 1.0 if used <= LOAD_SHARE else float(f"{LOAD_SHARE / used:.1g}")
+
+
+def _probe(plant: Plant, output: int) -> float:
+    return max(10 * plant.sensors.noise[output], SIZE)
+
+
+def _rooms(plant: Plant, output: int) -> tuple[float, float]:
+    """How far an output moves from rest to a contact, and to the end of what its sensor reads, SI; infinite: never."""
+    y, end = np.zeros(len(plant.outputs)), plant.sensors.range[output] or np.inf
+    y[output] = _probe(plant, output)
+    if not plant.contacts.names:
+        return np.inf, end
+    x = place_states(plant, ca.DM(plant.position_of(ca.DM(y))))
+    used = float(np.max(np.array(ca.DM(plant.contacts.contact(x)))))
+    return (y[output] / used if used > 0 else np.inf), end
 
 
 def _duration(controller: Controller, time: float) -> float:
     return time or SAMPLES * controller.sample_time
-
-
-def with_fidelity(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options with the default fidelity: "dq" for machines with windings, else "force"."""
-    return {"fidelity": "dq" if "dq" in fidelities(plant) else "force"} | dict(options)
-
-
-def _with_exact_sensors(options: Mapping[str, Any]) -> dict[str, Any]:
-    return {"noise": 0.0, "quantize": False} | dict(options)
 
 
 def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
@@ -212,26 +232,28 @@ def _step_merits(run: Trajectory, output: int, size: float) -> tuple[Merit, ...]
 
 
 def _load_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Figures of the output that moves furthest."""
-    error = np.abs(run.p - run.reference)
-    k = int(error.max(axis=0).argmax())
-    signal = run.plant.outputs[k]
-    fine = FINE_UNITS.get(signal.unit, signal.unit)
-    return (
-        Merit(f"{signal.name} moves by", float(error[:, k].max()), fine),
-        Merit(f"{signal.name}, left at the end", float(error[-1, k]), fine),
-    )
+    """Figures of the output that moves furthest, of each unit."""
+    error, merits = np.abs(run.p - run.reference), list[Merit]()
+    for unit in dict.fromkeys(signal.unit for signal in run.plant.outputs):
+        alike = [k for k, signal in enumerate(run.plant.outputs) if signal.unit == unit]
+        k = alike[int(error[:, alike].max(axis=0).argmax())]
+        name, fine = run.plant.outputs[k].name, FINE_UNITS.get(unit, unit)
+        merits.append(Merit(f"{name} moves by", float(error[:, k].max()), fine))
+        merits.append(Merit(f"{name}, left at the end", float(error[-1, k]), fine))
+    return tuple(merits)
 
 
 QUESTIONS = {
     "hold": "How still does it stand?",
     "step": "Does it go where it is sent?",
     "disturbance": "How far does a load move it, and does it come back?",
+    WORST_LOAD: "How far does the worst of all loads of this size move it?",
 }
 CASES: Mapping[str, Callable[..., list[PlannedRun]]] = {
     "hold": hold_cases,
     "step": step_cases,
     "disturbance": disturbance_cases,
+    WORST_LOAD: worst_load_cases,
 }
 EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
     name: experiment_of(name, question, CASES[name], merits_of_first) for name, question in QUESTIONS.items()
@@ -248,16 +270,25 @@ OPTIONS = {f.name for f in fields(Scenario)} - EXPERIMENT_FIELDS | {"engine"}
 
 def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
     """The experiments of a machine by name, its main job first."""
-    found: Mapping[str, Callable[..., Experiment]] = setting(plant, "EXPERIMENTS", EXPERIMENTS)
-    return found
+    return _own(plant, "EXPERIMENTS", EXPERIMENTS)
 
 
 def series_of(plant: Plant) -> Mapping[str, Callable[..., list[PlannedRun]]]:
     """The functions that list the runs of an experiment for campaigns, by the experiment's name."""
-    own: Mapping[str, Callable[..., list[PlannedRun]]] | None = setting(plant, "CASES", None)
-    if own is None:
-        return {} if experiments_of(plant) is not EXPERIMENTS else CASES
-    return own
+    return _own(plant, "CASES", {} if _has_own(plant) else CASES)
+
+
+def _has_own(plant: Plant) -> bool:
+    return setting(plant, "EXPERIMENTS", None) is not None
+
+
+def _own(plant: Plant, name: str, default: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The entries that a machine has of a setting, and the worst load's, which every machine under loads has."""
+    found: dict[str, Any] = dict(setting(plant, name, default))
+    found.setdefault(WORST_LOAD, (EXPERIMENTS if name == "EXPERIMENTS" else CASES)[WORST_LOAD])
+    if not plant.disturbances:
+        del found[WORST_LOAD]
+    return found
 
 
 def main_job(plant: Plant) -> str:
@@ -265,8 +296,13 @@ def main_job(plant: Plant) -> str:
     return next(iter(experiments_of(plant)))
 
 
-def settling_option(name: str, plant: Plant) -> dict[str, float]:
-    """The option with which yields of an experiment are counted: the machine's SETTLE before its main job."""
+def settling_option(name: str, plant: Plant, controller: Controller) -> dict[str, float]:
+    """The option with which yields of an experiment are counted: the machine's SETTLE before its main job.
+
+    A machine without experiments of its own rests for SAMPLES before each: v0 is not what another mass needs.
+    """
+    if not _has_own(plant):
+        return {"settle": SAMPLES * controller.sample_time}
     seconds = float(setting(plant, "SETTLE", 0.0)) if name == main_job(plant) else 0.0
     return {"settle": seconds} if seconds else {}
 
@@ -294,6 +330,8 @@ def experiment(
     disturbance: completed at 0.4 s
       w; y moves by 34.3 um; y, left at the end 0.0531 um
     """
+    controller = given_law("experiment", controller)
+    plant = given_plant("experiment", plant)
     _check(name, plant, options)
     return experiments_of(plant)[name](plant, controller, progress=progress, **options)
 
@@ -334,7 +372,10 @@ def options_of(name: str, plant: Plant) -> dict[str, Any]:
     """The options of an experiment's own signature with their defaults. Raises InputError for an unknown experiment."""
     known = experiments_of(plant)
     if name not in known:
-        raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(known))
+        more = (
+            "" if has_papers() or published_figures(plant.name) is None else f"; or one of {INSTALL_PAPERS}"
+        )
+        raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(known) + more)
     parameters = inspect.signature(known[name]).parameters.values()
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "progress"}
 
@@ -357,9 +398,20 @@ def option_of(name: str, plant: Plant, option: str, general: Iterable[str] = sor
     return mine[option]
 
 
+def check_of(name: str, plant: Plant) -> Callable[[str, str, Any], None] | None:
+    """The function `check` for the options of an experiment, of its paper where that has the experiment."""
+    _, printed = parts_of("experiments", plant.name)
+    if name == WORST_LOAD:
+        return None
+    of_paper = name in getattr(printed, "EXPERIMENTS", ())
+    found: Callable[[str, str, Any], None] | None
+    found = getattr(printed, "check", None) if of_paper else setting(plant, "check", None)
+    return found
+
+
 def _check(name: str, plant: Plant, options: Mapping[str, Any]) -> None:
     """InputError for an unknown experiment, an unknown option, or a value of the wrong kind."""
-    mine, check = options_of(name, plant), setting(plant, "check", None)
+    mine, check = options_of(name, plant), check_of(name, plant)
     for option, value in options.items():
         if option in OPTIONS and option not in mine:
             continue

@@ -19,7 +19,8 @@ from malta.errors import CheckError
 from malta.model.equilibrium import balance
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
-from malta.simulation.experiments import setting
+from malta.roots import sign_change
+from malta.simulation.experiments import setting, whole_experiment
 from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import Payload
@@ -63,14 +64,12 @@ def held_payload(plant: Plant) -> float:
 
     if share_used(0.0) >= 1:
         return 0.0
-    from scipy.optimize import brentq  # here: it takes long to load
-
     high = par.m
     while share_used(high) < 1:
         high *= 2
         if high > MAX_PAYLOAD:
             return math.inf
-    return float(brentq(lambda extra: share_used(extra) - 1, 0.0, high, xtol=1e-9))
+    return sign_change(lambda extra: share_used(extra) - 1, 0.0, high, 1e-9)
 
 
 def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[float, float]:
@@ -79,7 +78,8 @@ def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[fl
         return math.nan, math.inf
 
     def carries(mass: float) -> bool:
-        return experiment(PAYLOAD, plant, controller, masses=(mass,)).cases[0].run.verdict.completed
+        found = whole_experiment(experiment(PAYLOAD, plant, controller, masses=(mass,)))
+        return found.cases[0].run.verdict.completed
 
     return largest_mass(carries, most if math.isfinite(most) else MAX_PAYLOAD)
 

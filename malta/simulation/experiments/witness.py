@@ -15,8 +15,8 @@ from malta.model.places import position_in
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.simulation import references
-from malta.simulation.experiments import Case, scenario_of
-from malta.simulation.experiments.catalogue import SAMPLES, with_fidelity
+from malta.simulation.experiments import Case, scenario_of, with_fidelity
+from malta.simulation.experiments.catalogue import SAMPLES
 from malta.simulation.references import Reference
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
@@ -74,9 +74,7 @@ def settle_feedforward(controller: Controller, plant: Plant, x: FloatArray) -> C
     """The law with v0 moved by what its integrals add until a machine rests at the states x. Raises CheckError."""
     wanted = with_command(plant, balance(plant, x), plant_of(controller.parameters)).v
     known = controller.feedforward
-    held = known.at(position_in(plant, x))
-    if known.position.size:
-        held = held + known.position @ x[list(plant.controlled)][: known.position.shape[1]]
+    held = known.at_rest(position_in(plant, x), x[list(plant.controlled)])
     return replace(controller, feedforward=replace(known, v0=known.v0 + (np.asarray(wanted) - held)))
 
 

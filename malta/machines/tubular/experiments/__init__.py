@@ -5,15 +5,10 @@ hold          2000 samples at rest with sensor noise, Fig. 14 and Table III
 tilt          a circle in sensor plane 1, sensor plane 2 held, Fig. 16 and eq. (21)
 lift-off      from rest on the touchdown bearing, by each start-up estimator that fits the controller
 payload       masses picked during a hold, and a stroke with them
-thermal       a drifting support, seen by an outside laser and compensated, Fig. 15
 disturbance   force and torque steps, vibration of the housing, compliance over frequency
 faults        of sensors, samples, a phase and the DC link: survival or touchdown
-drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
-record-v0     v0(z) recorded by a slow stroke or from a log, beside the computed one
-carrier       the stator moves sideways, its acceleration fed forward or not, Sec. IV-A
 commissioning from the touchdown bearing to operation and back, by the supervisor of the exported C
 supervised-faults  the faults with that supervisor and without it: which touchdowns it prevents
-capture       displacements and tilts from which the mover returns, beside what the force limit allows
 """
 
 from __future__ import annotations
@@ -25,26 +20,15 @@ from typing import TYPE_CHECKING, Any
 from malta.errors import InputError
 from malta.machines.tubular.experiments.commissioning import commissioning, supervised_faults
 from malta.machines.tubular.experiments.disturbances import (
-    carrier,
-    carrier_cases,
     disturbance,
     disturbance_cases,
     hold,
     hold_cases,
-    thermal,
     tilt_cases,
 )
 from malta.machines.tubular.experiments.faults import faults
-from malta.machines.tubular.experiments.lifting import capture, lift_cases, lift_off, payload
-from malta.machines.tubular.experiments.strokes import (
-    DISTANCE,
-    RISE,
-    SETTLE as SETTLE,
-    drive_limit_cases,
-    drive_limits,
-    record_v0,
-    stroke_cases,
-)
+from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
+from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, SETTLE as SETTLE, stroke_cases
 from malta.simulation.experiments import Experiment, PlannedRun, experiment_of, merits_of_first
 
 if TYPE_CHECKING:
@@ -56,13 +40,8 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "tilt": experiment_of("tilt", "Does it tilt about sensor plane 2?", tilt_cases),
     "lift-off": lift_off,
     "payload": payload,
-    "thermal": thermal,
     "disturbance": disturbance,
     "faults": faults,
-    "drive-limits": drive_limits,
-    "record-v0": record_v0,
-    "carrier": carrier,
-    "capture": capture,
     "commissioning": commissioning,
     "supervised-faults": supervised_faults,
 }
@@ -73,47 +52,18 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "tilt": tilt_cases,
     "lift-off": lift_cases,
     "disturbance": disturbance_cases,
-    "drive-limits": drive_limit_cases,
-    "carrier": carrier_cases,
 }
-MIN_STROKE_TIME, MAX_STROKE_TIME = 0.5, 60.0  # s, of one way of the slow stroke
-MOST_POINTS = 201  # of a side of a map
-FINDINGS = ("payload", "disturbance", "faults", "carrier", "capture", "supervised-faults")
+FINDINGS = ("payload", "disturbance", "faults", "supervised-faults")
 ALONE = ("stroke", "hold", "tilt")
 WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
 STROKE_UNIT = "mm"
-OPTION_UNITS = {
-    "distance": "m",
-    "rise": "s",
-    "radius": "m",
-    "frequency": "Hz",
-    "masses": "kg",
-    "drift": "m",
-    "minute": "s",
-    "way": "s",
-    "carried": "m",
-    "within": "s",
-    "phase_error": "rad",
-}
+OPTION_UNITS = {"distance": "m", "rise": "s", "radius": "m", "frequency": "Hz", "masses": "kg"}
 
 
 def check(name: str, option: str, value: Any) -> None:
-    """Raise InputError for a number that is zero or not finite. Strokes and logs check their own options."""
-    if option in ("distance", "rise", "profile", "during", "only", "log", "known"):
+    """Raise InputError for a number that is zero or not finite. Strokes check their own options."""
+    if option in ("distance", "rise", "profile", "during", "only", "known"):
         return
-    if option == "way" and not MIN_STROKE_TIME <= value <= MAX_STROKE_TIME:
-        raise InputError(
-            "simulate",
-            f"{name}: way",
-            f"{value:g} s",
-            f"a time from {MIN_STROKE_TIME:g} to {MAX_STROKE_TIME:g} s",
-        )
-    if option == "points" and not (isinstance(value, int) and 3 <= value <= MOST_POINTS):
-        raise InputError(
-            "simulate", f"{name}: points", f"{value:g}", f"a whole number from 3 to {MOST_POINTS}"
-        )
-    if option == "phase_error" and value == 0:
-        return  # no machines with displaced cogging
     if not all(math.isfinite(v) and v for v in (value if option == "masses" else (value,))):
         raise InputError("simulate", f"{name}: {option}", repr(value), "finite, other than 0")
 

@@ -6,15 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.firmware.supervised_flight import Flown, Requests, require_compiler, supervised_engine
-from malta.firmware.supervisor import IN_FLIGHT, State
-from malta.firmware.supervisor_text import NUMBERS
 from malta.machines.tubular.experiments.faults import (
     FAULT_TIME,
     MAX_LANDING_SPEED,
@@ -41,6 +38,12 @@ from malta.simulation.experiments import (
 from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.controller import Controller
 
+if TYPE_CHECKING:
+    from malta.firmware.supervised_flight import Flown
+    from malta.firmware.supervisor import State
+
+# The exporter is imported where these experiments fly: all others do without it.
+
 STROKE, LAND, END = 0.4, 0.5, 0.75  # s: middle of the stroke, request to land, end
 FAULT_RUN_TIME = 0.4  # s, of a run with a fault: room for a landing
 SUFFIX = " (s)"  # in the label of a run with the supervisor
@@ -59,6 +62,8 @@ def commissioning(
 
     The exported C of controller and supervisor fly it, and a C compiler has to be there.
     """
+    from malta.firmware.supervised_flight import Requests, supervised_engine
+
     _require_own_engine("commissioning", options)
     own = {"start": rest_on_bearing(plant) | {plant.stroke.name: 0.0}, "cold": True, "bearing": True}
     reference = partial(references.stroke, start=-distance / 2, end=distance / 2, rise=rise, centre=STROKE)
@@ -92,6 +97,8 @@ def supervised_faults(
     moments : in place of those faults, all classes of faults.py, each at so many random moments of lift,
         operation, stroke and landing
     """
+    from malta.firmware.supervised_flight import Requests, supervised_engine
+
     _require_own_engine("supervised-faults", options)
     if moments:
         if during != "stroke":
@@ -136,6 +143,8 @@ def supervised_faults(
 
 def _require_own_engine(name: str, options: Mapping[str, Any]) -> None:
     """InputError without a C compiler, and for another engine than the exported C."""
+    from malta.firmware.supervised_flight import require_compiler
+
     require_compiler(name)
     engine = options.get("engine", "auto")
     if callable(engine) or engine == "virtual machine":
@@ -145,6 +154,9 @@ def _require_own_engine(name: str, options: Mapping[str, Any]) -> None:
 
 def _judge(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
     """The run with the verdict of a supervised flight: slow contact in a lift-off or at a landing's end is none."""
+    from malta.firmware.supervisor import IN_FLIGHT
+    from malta.firmware.supervisor_text import NUMBERS
+
     if run.verdict.name in ("interrupted", "diverged", run.plant.contacts.names[-1]):
         return run
     states = flown.states(run.t)
@@ -163,6 +175,9 @@ def _judge(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
 
 def _commissioning_merits(run: Trajectory, flown: Flown) -> tuple[Merit, ...]:
     """Times of the states, errors in flight, the largest jump of a command, and the speed at the end of the landing."""
+    from malta.firmware.supervisor import IN_FLIGHT
+    from malta.firmware.supervisor_text import NUMBERS
+
     states, followed = flown.states(run.t), flown.references(run.t)
     others = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
     error = np.abs(run.p - followed)

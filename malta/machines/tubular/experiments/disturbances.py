@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from malta.arrays import FloatArray
-from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
@@ -29,8 +26,6 @@ from malta.simulation.experiments import (
     sine_wrench,
     step_wrench,
 )
-from malta.simulation.readings import keys, normals
-from malta.simulation.scenario import Correction
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
@@ -107,89 +102,7 @@ def _sine_merits(run: Trajectory, output: int, frequency: float) -> tuple[Merit,
     return (Merit(f"amplitude of {run.plant.outputs[output].name}", amplitude(run, output, frequency), "um"),)
 
 
-# MALTA on a carrier that accelerates sideways, with and without radial feedforward of the known acceleration.
-#
-# Sec. IV-A: the first four components of v_FF can counter "any known radial disturbances, e.g. when the MALTA is
-# moved with parallel kinematics in pick-and-place robots". Reading: the stator moves along x by a known quintic, from
-# rest to rest; seen from the stator, the inertial force -m a acts at the mover's centre of gravity. The acceleration
-# is known at the sample at which it acts, not before.
-
-
-BEGIN, TIME_AFTER = 0.02, 0.08  # s, before and after the carrier's move
-FED_SHARES = {"not fed forward": 0.0, "fed forward": 1.0, "90 % fed forward": 0.9}  # of the acceleration
-
-
-def carrier(
-    plant: Plant,
-    controller: Controller,
-    *,
-    carried: float = 0.1,
-    within: float = 0.2,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Experiment:
-    """The carrier moves sideways by `carried` (m) in `within` (s): at rest and during the published stroke, with the
-    inertial force fed forward and without."""
-    wanted = carrier_cases(plant, controller, carried=carried, within=within, **options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    t = np.arange(0, wanted[0].scenario.duration, controller.sample_time)
-    acceleration = carrier_acceleration(t, carried, within)
-    found = (
-        Merit("largest acceleration of the carrier", float(np.abs(acceleration).max()), "m/s^2"),
-        Merit("largest inertial force", float(plant.stroke.mass * np.abs(acceleration).max()), "N"),
-    )
-    curves = {"t": t, "acceleration": acceleration}
-    return Experiment("carrier", "Does it ride along?", cases, found, curves, interrupted=cut)
-
-
-def carrier_cases(
-    plant: Plant, _: Controller, *, carried: float, within: float, **options: Any
-) -> list[PlannedRun]:
-    """The runs of `carrier`: at rest, and during the published stroke."""
-    duration = BEGIN + within + TIME_AFTER
-    wanted = []
-    for place, reference in (("rest", references.hold), ("stroke", partial(delayed_stroke, wait=BEGIN))):
-        for label, share in FED_SHARES.items():
-            acts = partial(inertial_wrench, plant=plant, carried=carried, within=within)
-            own: dict[str, Any] = {"disturbance": acts}
-            own |= {"anticipated": partial(acts, share=share)} if share else {}
-            scenario = scenario_of("carrier", duration, reference, own | options)
-            wanted.append(PlannedRun(f"{place}, {label}", scenario, _merits))
-    return wanted
-
-
-def carrier_acceleration(t: FloatArray, carried: float, within: float) -> FloatArray:
-    """Acceleration of the carrier at the times t, m/s^2: a quintic from rest to rest that begins at BEGIN."""
-    _, __, shape = references.quintic(
-        np.asarray(t) - BEGIN - within / 2, within / references.QUINTIC_DURATION
-    )
-    return carried * shape
-
-
-def inertial_wrench(
-    t: FloatArray, plant: Plant, carried: float, within: float, share: float = 1.0
-) -> FloatArray:
-    """The wrench on the mover as seen from the carrier, or a share of it, at the times t."""
-    wrench = np.zeros((len(t), len(plant.disturbances)))
-    column = [s.name for s in plant.disturbances].index("F_x")
-    wrench[:, column] = -share * plant.stroke.mass * carrier_acceleration(t, carried, within)
-    return wrench
-
-
-def _merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Radial deviation and the bearing currents."""
-    error, axis = run.p - run.reference, run.plant.stroke_output
-    radial = error[:, [k for k in range(error.shape[1]) if k != axis]]
-    bearings = [k for k in range(len(run.plant.inputs)) if k != run.plant.thrust_input]
-    constant = np.array(run.plant.actuator.force_constant)[bearings]
-    return (
-        Merit("radial deviation", float(np.abs(radial).max()), "um"),
-        Merit("rms of x1", rms(error[:, 0]), "um"),
-        Merit("largest bearing current", float(np.abs(run.v[:, bearings] / constant).max()), "A"),
-    )
-
-
-# MALTA at rest: sensor noise, a tilt about one sensor plane, and a support that drifts.
+# MALTA at rest: sensor noise, and a tilt about one sensor plane.
 
 
 def hold_cases(_: Plant, controller: Controller, **options: Any) -> list[PlannedRun]:
@@ -256,67 +169,3 @@ def _tilt_merits(run: Trajectory, settled: float) -> tuple[Merit, ...]:
         Merit("SP1: largest tracking error, true", float(np.hypot(error[:, 0], error[:, 1]).max()), "um"),
         Merit("largest bearing force", float(np.abs(run.v[:, :4]).max()), "N"),
     )
-
-
-def thermal(
-    plant: Plant,
-    controller: Controller,
-    *,
-    drift: float = 65e-6,
-    minute: float = 60.0,
-    faster: float = 30.0,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Experiment:
-    """The support drifts sideways by `drift` (m) over `minute` (s), run `faster` times as fast.
-
-    A laser on a fixed support reads the mover's position in sensor plane 2 every 10 ms with 0.1 um of noise; half of
-    each reading is subtracted from the reference of both planes.
-    """
-    duration, every, gain = minute / faster, 10e-3, 0.5
-    moved = partial(_drift, drift=drift, duration=duration)
-    merits = partial(_thermal_merits, moved=moved, late=duration / 10)
-    wanted = []
-    for label, share in (("compensated", gain), ("not compensated", 0.0)):
-        laser = _Laser(moved, share, [0, 2], len(plant.outputs))
-        scenario = scenario_of(
-            "thermal", duration, references.hold, {"correction": Correction(every, laser)} | options
-        )
-        wanted.append(PlannedRun(label, scenario, merits))
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    lag = drift / duration * every / gain
-    found = (
-        Merit("drift of the support", drift, "um", "thermal.drift"),
-        Merit("lag if the mover goes where it is sent", lag, "um"),
-        Merit("the same at the true speed", lag / faster, "um", key="lag_at_true_speed"),
-    )
-    curves = {"drift": moved(cases[0].run.t)}
-    return Experiment("thermal", "Does it hold its place in space?", cases, found, curves, interrupted=cut)
-
-
-def _thermal_merits(run: Trajectory, moved: Callable[[Any], Any], late: float) -> tuple[Merit, ...]:
-    """Deviation in space from `late` (s) on."""
-    outside = (run.p[:, 2] + moved(run.t))[run.t >= min(late, run.t[-1])]
-    return (
-        Merit("largest deviation in space", float(np.abs(outside).max()), "um"),
-        Merit("rms deviation in space", rms(outside), "um"),
-    )
-
-
-def _drift(t: Any, drift: float, duration: float) -> Any:
-    """Displacement of the support, m, at the times t."""
-    return drift * np.asarray(t) / duration
-
-
-class _Laser:
-    """The outer loop of `thermal`: it integrates the laser's readings into an offset of the reference."""
-
-    def __init__(self, moved: Callable[[Any], Any], gain: float, columns: list[int], size: int) -> None:
-        self.moved, self.gain, self.columns = moved, gain, columns
-        self.offset, self.readings = np.zeros(size), 0
-
-    def __call__(self, t: float, p: FloatArray) -> FloatArray:
-        noise = 0.1e-6 * float(normals(keys(0, np.array([self.readings]))[0], 1, 1)[0, 0])
-        self.readings += 1
-        self.offset[self.columns] -= self.gain * (p[2] + float(self.moved(t)) + noise)
-        return self.offset.copy()

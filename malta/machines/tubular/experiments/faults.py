@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,15 +19,6 @@ from numpy.typing import NDArray
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.firmware.flight import view
-from malta.firmware.supervised_flight import (
-    Flown,
-    Interference,
-    Requests,
-    supervised_engine,
-    unsupervised_engine,
-)
-from malta.firmware.supervisor_text import NUMBERS
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, delayed_stroke
 from malta.model.equilibrium import trim
@@ -48,6 +39,11 @@ from malta.simulation.scenario import Fault, Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.firmware.supervised_flight import Flown, Interference, Requests
+
+# As in commissioning.py, the exporter is imported where its C flies.
 
 # Faults of sensors, samples, a phase and the DC link.
 
@@ -209,6 +205,8 @@ def change_reading(
     """What a fault does to a reading: from (fault, old value) the new one; `at` is its place, "" for all."""
 
     def change(b: Blow, inputs: Any, _: Any) -> None:
+        from malta.firmware.flight import view
+
         values, k = view(inputs, name), getattr(b, at) if at else slice(None)
         values[k] = new(b, values[k])
 
@@ -227,6 +225,8 @@ def _cut_torque(_: Blow, __: Any, request: Any) -> None:
 
 
 def _stick_gates(b: Blow, outputs: Any) -> None:
+    from malta.firmware.flight import view
+
     view(outputs, "command")[b.current] = 1.0 if b.sign > 0 else 0.0
 
 
@@ -364,6 +364,7 @@ def _draw_fault(kind: FaultKind, m: int, plant: Plant, rng: np.random.Generator)
 
 def _interference(b: Blow) -> Interference:
     """What the fault does at each sample from its moment on."""
+    from malta.firmware.supervised_flight import Interference
 
     def before(t: float, inputs: Any, request: Any) -> None:
         if request is not None:
@@ -394,6 +395,8 @@ def _scenario(plant: Plant, phase: Phase, faults: tuple[Fault, ...], options: Ma
 
 def _requests(plant: Plant, phase: Phase) -> Requests:
     """What is asked for in a phase."""
+    from malta.firmware.supervised_flight import Requests
+
     if phase == "lift":
         return Requests()
     rest = outputs_at(plant, plant.at(**rest_on_bearing(plant)).x)
@@ -402,6 +405,8 @@ def _requests(plant: Plant, phase: Phase) -> Requests:
 
 def _healthy(plant: Plant, c: Controller, phase: Phase, options: Mapping[str, Any]) -> Flown:
     """The flight of a phase without a fault."""
+    from malta.firmware.supervised_flight import supervised_engine
+
     flights: list[Flown] = []
     engine = supervised_engine(flights, _requests(plant, phase))
     _fly(plant, c, _scenario(plant, phase, (), options), engine, None)
@@ -427,6 +432,9 @@ def _strike(
     progress: Progress | None,
 ) -> tuple[FaultOutcome, Trajectory]:
     """A fault with the supervisor and without it: what came of both, and the supervised run."""
+    from malta.firmware.supervised_flight import supervised_engine, unsupervised_engine
+    from malta.firmware.supervisor_text import NUMBERS
+
     simulated = () if b.kind.simulated is None else b.kind.simulated(b, plant, c.sample_time)
     scenario = _scenario(plant, b.phase, simulated, options)
     flights: list[Flown] = []

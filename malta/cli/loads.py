@@ -1,0 +1,167 @@
+"""`malta loads`: how large any load may be, whatever its waveform, as a theorem of the nonlinear machine."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from malta.cli.options import (
+    NUMBER,
+    AsJson,
+    Changes,
+    GainFile,
+    MachineFile,
+    WholeTime,
+    change_machine,
+    parameters,
+    read_controller,
+    read_uncertainty,
+    require_suffixes,
+)
+from malta.cli.output import (
+    make_console,
+    print_document,
+    print_note,
+    print_text,
+    print_written,
+    require_whole,
+    work_until,
+)
+from malta.errors import CheckError, InputError
+from malta.files import PICTURES
+
+if TYPE_CHECKING:
+    from malta.loops.loop import Loop
+    from malta.margins.load_sizes import LoadLimit
+
+
+def loads(
+    gains: GainFile,
+    load: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A load: F_x; at a point F_x=1,T_y=-45mm; both at once F_x+F_y. Repeatable. [each of the machine]",
+        ),
+    ] = None,
+    change: Changes = None,
+    uncertain: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--uncertain",
+            metavar="SHARE|NAME=SHARE",
+            autocompletion=parameters,
+            help="How far parameters are off at most, and may move in flight: 5% (those of the gain file), m=5%, ... "
+            "[nominal]",
+        ),
+    ] = None,
+    noise: Annotated[
+        float, typer.Option(metavar="N", help="Errors of readings are at most so many times their rms.")
+    ] = 6.0,
+    time: WholeTime = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A picture: clearance used over the load. .png, .svg, .pdf."),
+    ] = None,
+    machine: MachineFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Prove how large any load may be before the nonlinear machine touches or saturates, whatever its waveform.
+
+    Beside it: what ends the proof, the shares of clearances and forces that are used, and the size from which on some
+    waveform makes the linear loop touch. Of the machine with forces as `fidelity=force` flies them, from rest; induced
+    voltages, voltage limits and the DC link are left out. Exit code 1 where the loop is unstable.
+
+    \b
+    Example:  malta loads design/gains/robust.json --load F_x --load F_x+F_y
+    """
+    from malta.loops.loop import loop as loop_of
+    from malta.margins.load_sizes import load_limits
+    from malta.model.plants import plant_of
+
+    require_suffixes((out, PICTURES))
+    controller = read_controller(gains, machine)
+    plant = plant_of(change_machine(controller.parameters, change))
+    asked = [read_load(text) for text in load or ()] or None
+    box = read_uncertainty(gains, uncertain, plant.parameters) if uncertain else {}
+    loop = loop_of(plant, controller)
+    _require_stable(gains, loop)
+    with work_until("loads", time) as work:
+        found = load_limits(loop, asked, box, noise=noise, courses=out is not None)
+    files = [] if out is None else _draw(controller.name, found, out)
+    if as_json:
+        from malta.cli.documents.loads import loads_output
+
+        print_document(loads_output(gains, loop, found, box, files))
+    else:
+        _print(gains, loop, found, box, change or ())
+        print_written(make_console(), files)
+    require_whole(work)
+
+
+def _draw(name: str, found: Sequence[LoadLimit], picture: Path) -> list[Path]:
+    """Draw the use of clearance over the load, where there is one."""
+    from malta.report.figures.loads import load_limits_figure
+
+    if not any(one.course for one in found):
+        print_note(f"{picture} is not drawn: no load is proven that uses a clearance of a contact")
+        return []
+    load_limits_figure(found, name, picture)
+    return [picture]
+
+
+def read_load(text: str) -> Any:
+    """Read a load as `malta.safe_load` takes it: a name, shares of several, or several at once.
+
+    Raises InputError for another form.
+    """
+    parts = [_read_part(part.strip()) for part in text.split("+")]
+    return parts[0] if len(parts) == 1 else parts
+
+
+def _read_part(text: str) -> str | dict[str, float]:
+    """A name, or shares NAME=NUMBER with a comma between them; a lever may have a unit of length."""
+    from malta.units import to_si
+
+    if "=" not in text:
+        return text
+    shares: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, value = (word.strip() for word in part.partition("="))
+        number = re.fullmatch(NUMBER, value)
+        if number is None or name in shares:
+            raise InputError("--load", name, repr(text), "a name, or shares as F_x=1,T_y=-45mm")
+        shares[name] = (
+            to_si(float(number[1]), number[2], "m", "--load", name) if number[2] else float(number[1])
+        )
+    return shares
+
+
+def _require_stable(gains: Path, loop: Loop) -> None:
+    """Raise CheckError for an unstable loop, of which nothing is asked."""
+    if not loop.stable:
+        radius = loop.sampled.spectral_radius
+        raise CheckError(f"{gains}: the loop (machine) is unstable, |lambda| = {radius:.6f}")
+
+
+def _print(
+    gains: Path, loop: Loop, found: Sequence[LoadLimit], box: dict[str, float], changes: Sequence[str]
+) -> None:
+    """Print the table, and what it is of."""
+    from malta.model.parameters import box_words
+    from malta.report.tables.loads import load_limits_table, load_limits_text, place_text
+
+    console, par = make_console(), loop.plant.parameters
+    preset = f"{par.preset} {' '.join(changes)}".rstrip()
+    print_text(console, f"{gains}: {loop.controller.name}, {loop.plant.name}, preset {preset}")
+    console.print(load_limits_table(found))
+    if box:
+        print_text(
+            console,
+            f"Anywhere in {box_words(box, par)}, which may move in flight; the linear loop is nominal.",
+        )
+    print_text(console, load_limits_text(found, place_text(loop)))
