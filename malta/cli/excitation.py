@@ -108,7 +108,7 @@ def excite(
     \b
     Example:  malta excite design/gains/robust.json --motion 20um --log log.npz
     """
-    from malta.identification.excite import excite as plan_excitation
+    from malta.identification.excite import excite as plan_excitation, motion_unit
     from malta.identification.log_files import SUFFIXES
     from malta.loops.loop import loop
     from malta.model.plants import plant_of
@@ -117,8 +117,7 @@ def excite(
     require_suffixes((out, (".csv",)), (log, SUFFIXES))
     controller = read_controller(gains, machine)
     plant = plant_of(controller.parameters)
-    own = {s.unit for s in plant.outputs}
-    units = {"force": "N", "current": "A", "motion": own.pop() if len(own) == 1 and own != {"1"} else "m"}
+    units = {"force": "N", "current": "A", "motion": "m" if motion is None else motion_unit(plant)}
     given = {"force": force, "current": current, "motion": motion}
     sizes = {
         name: read_assignments(f"--{name}", [f"{name}={text}"], units)[name]

@@ -55,7 +55,6 @@ SCENARIO_FIELDS: Mapping[str, GeneralOption] = {
     "substeps": GeneralOption(0, "Runge-Kutta steps a sample; the error is estimated"),
     "accuracy": GeneralOption(0.0, "wanted integration error, in m or rad; 1e-9 without it"),
 }
-LENGTHS = {"distance": "m", "rise": "s", "settle": "s"}  # units of options that many machines have
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
 EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
 EXAMPLE = "gain_x1=0.02 or offset_y2=5um"  # of the others
@@ -170,10 +169,10 @@ def read_options(texts: list[str] | None, scenario: str, plant: Plant) -> dict[s
 
     Raises InputError for an unknown option, one that is given twice, or a value of another type.
     """
-    from malta.simulation.experiments import setting
-    from malta.simulation.experiments.catalogue import option_of
+    from malta.simulation.experiments.catalogue import option_of, option_units
 
-    units = LENGTHS | setting(plant, "OPTION_UNITS", {})
+    given = dict(_split(text) for text in texts or ())
+    units = option_units(scenario, plant, given)
     merged: dict[str, Any] = {}
     for text in texts or ():
         name, value = _split(text)
@@ -224,8 +223,11 @@ def _in_si(number: re.Match[str], si_unit: str, option: str, name: str) -> float
     from malta.units import to_si
 
     value, unit = float(number[1]), number[2]
-    if si_unit != "1":
+    if si_unit not in ("", "1"):
         return to_si(value, unit or si_unit, si_unit, option, name)
+    if unit and not si_unit:
+        expected = "no unit, or signals that have one in common, by output=NAME or on=NAME"
+        raise InputError(option, f"{name}.unit", repr(unit), expected)
     if unit not in ("", "%", "percent"):
         raise InputError(option, f"{name}.unit", repr(unit), "no unit, or %")
     return value * (0.01 if unit else 1.0)

@@ -190,6 +190,12 @@ def excite(
     return _plan(loop, model, signal, periods, found.times(share[axis]), named=bool(parameters))
 
 
+def motion_unit(plant: Plant) -> str:
+    """The unit that a motion is given in: the one of what it bounds; m of angles beside positions."""
+    units = {plant.outputs[k].unit for k in _moving_outputs(plant)}
+    return units.pop() if len(units) == 1 else "m"
+
+
 def _moving_outputs(plant: Plant) -> list[int]:
     """The outputs that a motion bounds: those in m or rad; all of one unit. Raises InputError for others."""
     units = dict.fromkeys(s.unit for s in plant.outputs)

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -710,6 +711,20 @@ def test_every_scenario_takes_general_options(plant: Plant, text: str, value: ob
     for wrong in (text, f"{text.partition('=')[0]}="):
         with pytest.raises(InputError):
             read_options([text, wrong], "hold", plant)
+
+
+def test_a_size_has_the_unit_of_its_signals() -> None:
+    plant = malta.read_design(ROOT / "examples/magnet/design/with_current.toml").plant
+    read = partial(read_options, plant=plant)
+    assert read(["size=50um", "time=20ms"], "step") == {"size": 50e-6, "time": 0.02}
+    assert read(["size=700mN"], "disturbance") == read(["size=0.7"], "worst-load") == {"size": 0.7}
+    with pytest.raises(InputError, match=r"--option: size\.unit: found 'mV', expected a unit of m"):
+        read(["size=50mV"], "step")
+    hybrid = malta.read_design(ROOT / "tests/foreign/hybrid/design/hybrid.toml").plant
+    with pytest.raises(InputError, match="signals that have one in common, by output=NAME or on=NAME"):
+        read_options(["size=50mA"], "disturbance", hybrid)
+    load = hybrid.disturbances[0]
+    assert read_options([f"size=50m{load.unit}", f"on={load.name}"], "disturbance", hybrid)["size"] == 0.05
 
 
 def test_the_help_of_the_file_is_the_help_of_the_commands() -> None:

@@ -28,8 +28,8 @@ from malta.report.tables import (
     new_table,
     published_text,
 )
-from malta.simulation.experiments import Experiment, setting
-from malta.simulation.experiments.catalogue import experiments_of, options_of
+from malta.simulation.experiments import Experiment
+from malta.simulation.experiments.catalogue import experiments_of, option_units, options_of
 from malta.units import FINE_UNITS, unit_factor
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table
 
 def _options(name: str, plant: Plant) -> list[str]:
     """Options of an experiment with their defaults and units, as the command line takes them."""
-    units, shown = setting(plant, "OPTION_UNITS", {}), []
+    units, shown = option_units(name, plant), list[str]()
     for option, default in options_of(name, plant).items():
         values = default if isinstance(default, tuple) else (default,)
         text = ",".join(str(v).lower() if isinstance(v, bool) else f"{v}" for v in values)

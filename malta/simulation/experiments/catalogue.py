@@ -30,6 +30,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import partial
 from numbers import Real
+from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -265,6 +266,14 @@ EXPERIMENT_FIELDS = {
     *("name", "reference", "start", "cold", "disturbance", "anticipated", "excitation"),
     *("faults", "correction", "changes"),
 }
+COMMON_UNITS = {
+    "distance": "m",
+    "rise": "s",
+    "settle": "s",
+    "time": "s",
+}  # of options that many experiments have
+SIZED = {"step", "disturbance", WORST_LOAD}  # experiments here with a `size`, in the unit of signals
+NONE_GIVEN: Mapping[str, str] = MappingProxyType({})
 OPTIONS = {f.name for f in fields(Scenario)} - EXPERIMENT_FIELDS | {"engine"}
 
 
@@ -378,6 +387,20 @@ def options_of(name: str, plant: Plant) -> dict[str, Any]:
         raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(known) + more)
     parameters = inspect.signature(known[name]).parameters.values()
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "progress"}
+
+
+def option_units(name: str, plant: Plant, options: Mapping[str, str] = NONE_GIVEN) -> dict[str, str]:
+    """SI units of an experiment's options by name; of a `size`, that of all signals that `options` choose, or none."""
+    units: dict[str, str] = COMMON_UNITS | setting(plant, "OPTION_UNITS", {})
+    if name not in SIZED or experiments_of(plant).get(name) is not EXPERIMENTS[name]:
+        return units
+    if name == "step":
+        signals, which = [plant.outputs[k] for k in holdable_outputs(plant)], options.get("output", "all")
+    else:
+        signals = list(plant.disturbances)
+        which = options.get("on") or (signals[0].name if name == WORST_LOAD else "all")
+    chosen = {s.unit for s in signals if which in ("all", s.name)}
+    return {"size": chosen.pop() if len(chosen) == 1 else ""} | units
 
 
 def option_of(name: str, plant: Plant, option: str, general: Iterable[str] = sorted(OPTIONS)) -> Any:
