@@ -16,6 +16,7 @@ import pytest
 from conftest import ROOT, Run, one_sentence
 from figure_checks import defects, texts_of
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 import malta
 from malta import report
@@ -370,6 +371,21 @@ def test_a_region_is_hatched_where_the_judge_fails(bound: float) -> None:
     assert {verdicts["peak_sensitivity"], verdicts["recovery w largest"]} == {
         "holds" if bound > 1.6 else "fails"
     }
+
+
+@pytest.mark.parametrize("channel", ["x1", "z"])
+def test_no_curve_passes_the_name_of_a_nyquist_plots_region(channel: str) -> None:
+    spec = malta.read_design(ROOT / "design" / "robust.toml")
+    curves = loop_curves(spec.plant, malta.gains.read(GAINS / "robust.json"))
+    figure = report.nyquist(curves, channel=channel, limits=curve_limits(spec))
+    figure.draw_without_rendering()
+    (panel,) = figure.axes
+    (name,) = [text for text in panel.texts if text.get_text() == "peak sensitivity asked"]
+    box = Text.get_window_extent(name)  # without its line to the disk
+    for line in panel.lines:
+        places = panel.transData.transform(np.column_stack(line.get_data()))
+        between = np.linspace(places[:-1], places[1:], 50).reshape(-1, 2)
+        assert not ((between > box.min) & (between < box.max)).all(axis=1).any()
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from malta.report.figures.drawing import BOUND_LINE, BOUND_STYLE, LEGEND, NOTE, 
 from malta.report.plots.frequency import ONE_LOOP, Channel, fails_peak, phase_of, title_of
 from malta.report.plots.panels import (
     CLEAR_BOX,
+    FORBIDDEN,
     LIMIT_LINE,
     PLACES,
     chosen_channels,
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 MAX_LEFT_REACH = 4.0  # how far left of the origin a Nyquist plot reaches at most
 M_CIRCLES = (12.0, 6.0, 3.0, 1.0, 0.0, -3.0, -6.0, -12.0)  # dB of |T|
+LEADER = {"arrowstyle": "-", "linewidth": 0.6, "color": FORBIDDEN, "shrinkA": 0, "shrinkB": 0}
 HEIGHTS = (-45.0, 60.0)  # dB, of a Nichols plot
 
 
@@ -104,7 +106,8 @@ def nyquist(
             lines.append((margins_text(margins, turns=True), style["color"]))
         for limit in limits if at == "sensors" else ():
             if limit.curve == "S":
-                _draw_exclusion(panel, limit, fails=fails_peak(loops, name, limit))
+                curves_here = [curves.responses.alone(at)[:, k] for _, curves, k, _ in found]
+                _draw_exclusion(panel, limit, window, curves_here, fails=fails_peak(loops, name, limit))
         panel.set_xlim(window[0], window[1])
         panel.set_ylim(-window[2], window[2])
         panel.set_aspect("equal", adjustable="box")
@@ -116,19 +119,50 @@ def nyquist(
     return sheet.figure
 
 
-def _draw_exclusion(axes: Axes, limit: CurveLimit, *, fails: bool) -> None:
-    """The disk about -1 that a bound of `|S|` keeps a loop out of."""
+def _draw_exclusion(
+    axes: Axes, limit: CurveLimit, window: Window, curves: Sequence[ComplexArray], *, fails: bool
+) -> None:
+    """The disk about -1 that a bound of `|S|` keeps a loop out of, and its name where no curve passes."""
     radius, turn = 1 / limit.limit, np.exp(1j * np.linspace(0, 2 * np.pi, 200))
     for style in region_styles(fails=fails):
         axes.fill(-1 + radius * turn.real, radius * turn.imag, **style)
     axes.plot(-1 + radius * turn.real, radius * turn.imag, **LIMIT_LINE)
+    text = f"{limit.words} {'FAILS' if fails else 'asked'}"
+    place = _free_place(window, radius, (0.021 * len(text), 0.05), curves)
+    towards = place + 1
     axes.annotate(
-        f"{limit.words} {'FAILS' if fails else 'asked'}", (-1, -radius), xytext=(0, -2), va="top", ha="center",
-        textcoords="offset points", zorder=6, **limit_text(fails=fails),
+        text, (-1 + radius * towards.real / abs(towards), radius * towards.imag / abs(towards)),
+        xytext=(place.real, place.imag), va="center", ha="center", zorder=6, arrowprops=LEADER,
+        **limit_text(fails=fails),
     )  # fmt: skip
 
 
-def _window(found: list[ChannelMargins]) -> tuple[float, float, float]:
+def _free_place(
+    window: Window, radius: float, share: tuple[float, float], curves: Sequence[ComplexArray]
+) -> complex:
+    """The middle of a text of this share of a window that lies on no curve: at the disk about -1, else in a corner."""
+    left, right, high = window
+    half = complex(share[0] * (right - left) / 2, share[1] * high)
+    low = -radius - 1.4 * half.imag
+    ends = [left + 1.1 * half.real, right - 1.1 * half.real]
+    corners = [complex(x, y) for x in ends[::-1] for y in (1.6 * half.imag - high, high - 1.6 * half.imag)]
+    places = [complex(-1, low), complex(-1, -low), *corners]
+    steps = np.linspace(0, 1, 20)[:, None]
+    lines = [np.ravel(c[:-1] + steps * np.diff(c)) for c in curves]
+    points = np.concatenate([*lines, *np.conj(lines)])
+
+    def covered(place: complex) -> int:
+        away = points - place
+        return int(((np.abs(away.real) < half.real) & (np.abs(away.imag) < half.imag)).sum())
+
+    free = [place for place in places if left < place.real - half.real and not covered(place)]
+    return free[0] if free else min(places, key=covered)
+
+
+Window = tuple[float, float, float]  # left and right end, and half of the height
+
+
+def _window(found: list[ChannelMargins]) -> Window:
     """Left and right end and half the height: the unit circle, and gain margins within MAX_LEFT_REACH."""
     left = -1.9
     for margins in found:
@@ -141,7 +175,7 @@ def _window(found: list[ChannelMargins]) -> tuple[float, float, float]:
     return left, right, max(1.3, (right - left) / 2)
 
 
-def _inside(gain: ComplexArray, window: tuple[float, float, float]) -> ComplexArray:
+def _inside(gain: ComplexArray, window: Window) -> ComplexArray:
     """The curve without what lies far outside of the window; NaN interrupts the line."""
     reach = 4 * max(abs(window[0]), window[2])
     return np.asarray(np.where(np.abs(gain) < reach, gain, complex(np.nan, np.nan)))
@@ -170,9 +204,7 @@ def _draw_direction(axes: Axes, gain: ComplexArray, style: Mapping[str, Any]) ->
     )  # fmt: skip
 
 
-def _draw_margins(
-    axes: Axes, found: ChannelMargins, style: Mapping[str, Any], window: tuple[float, float, float]
-) -> None:
+def _draw_margins(axes: Axes, found: ChannelMargins, style: Mapping[str, Any], window: Window) -> None:
     """The circles of max|S| and of the disk margin, and the crossings at which margins are read."""
     if not found.stable:
         return
