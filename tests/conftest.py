@@ -8,6 +8,7 @@ import io
 import math
 import os
 import pickle
+import random
 import re
 import secrets
 import shutil
@@ -57,20 +58,44 @@ ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
 
 
-@pytest.hookimpl(tryfirst=True)  # before hypothesis reads the seed, which workers have from here
+@pytest.hookimpl(tryfirst=True)  # before hypothesis reads the seed
 def pytest_configure(config: pytest.Config) -> None:
     fast = "not slow" in config.option.markexpr
     hypothesis.settings.load_profile("fast" if fast else "untimed")
     if not fast and config.option.hypothesis_seed is None:
-        config.option.hypothesis_seed = secrets.randbits(32)
+        known: dict[str, Any] = getattr(config, "workerinput", {})
+        config.option.hypothesis_seed = known.get("malta_seed", secrets.randbits(32))
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False  # pytest-xdist keeps the order below
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Workers of pytest-xdist draw with the seed that the header tells."""
+    node.workerinput["malta_seed"] = node.config.option.hypothesis_seed
 
 
 def pytest_report_header(config: pytest.Config) -> str | None:
     """Cases of the longer tests are drawn anew each time: what repeats them."""
     seed = config.option.hypothesis_seed
-    return None if seed is None else f"cases drawn with --hypothesis-seed={seed}"
+    if seed is None:
+        return None
+    whole = "" if SHARE == 1 else f"{SHARE:.0%} of the cases of each longer test (SHARE), "
+    return f"{whole}cases drawn with --hypothesis-seed={seed}"
+
+
+SHARE = float(os.environ.get("SHARE", "1"))  # of the cases of each longer test that are run, at least one
+
+
+def undrawn_cases(items: list[pytest.Item], seed: int | None) -> set[str]:
+    """Cases of the longer tests that are left out, the same ones by every worker."""
+    cases: dict[str, list[str]] = {}
+    for item in items:
+        if item.get_closest_marker("slow") and "[" in item.nodeid:
+            cases.setdefault(item.nodeid.partition("[")[0], []).append(item.nodeid)
+    draw = random.Random(seed)
+    kept = {name for names in cases.values() for name in draw.sample(names, math.ceil(SHARE * len(names)))}
+    return {name for names in cases.values() for name in names} - kept
 
 
 UNKNOWN_CASES = pytest.StashKey[
@@ -90,6 +115,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if case.removesuffix("]") in mark.args:
                 item.add_marker(pytest.mark.slow)
     config.stash[UNKNOWN_CASES] = named - known
+    left = undrawn_cases(items, config.option.hypothesis_seed) if SHARE < 1 else set()
+    config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left])
+    items[:] = [item for item in items if item.nodeid not in left]
     items.sort(key=lambda item: item.get_closest_marker("first") is None)
 
 

@@ -10,7 +10,10 @@ from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import conftest
 import pytest
 from conftest import ROOT, UNKNOWN_CASES
 from house import ORDER as PACKAGES, imported, reached
@@ -268,6 +271,24 @@ def test_what_is_remembered_of_machines_is_bounded() -> None:
 def test_slow_cases_exist(request: pytest.FixtureRequest) -> None:
     """A case that got another name would be a fast one again, unseen."""
     assert request.config.stash[UNKNOWN_CASES] == set()
+
+
+def test_a_share_of_the_slow_cases_is_drawn_by_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By each worker the same, of every test one at least, and none of the fast tests is left out."""
+
+    def item(name: str, *, slow: bool = True) -> Any:
+        return SimpleNamespace(nodeid=name, get_closest_marker=lambda _: slow)
+
+    items = [item(f"a.py::test_a[{k}]") for k in range(10)] + [
+        item("a.py::test_one[x]"),
+        item("a.py::test_b"),
+    ]
+    items += [item(f"a.py::test_fast[{k}]", slow=False) for k in range(10)]
+    monkeypatch.setattr(conftest, "SHARE", 0.25)
+    left = [conftest.undrawn_cases(items, seed) for seed in (1, 1, 2)]
+    assert left[0] == left[1] != left[2]
+    assert [len(one) for one in left] == [7, 7, 7]
+    assert all(name.startswith("a.py::test_a[") for name in left[0])
 
 
 # What a room never imports, in functions neither, whatever stands below it.
