@@ -50,10 +50,10 @@ mutants: $(VENV)/dev
 	PYTHONPATH=tests $(BIN)/python -m mutants
 
 # With the kernels that OpenBLAS chooses itself, then with others: an old processor's, and where there is AVX-512 its own.
-# Of the longer tests half of the cases, to end within 90 minutes on a loaded computer: `make slow` runs all.
+# Of the longer tests a third of the cases, to end within 90 minutes on a loaded computer: `make slow` runs all.
 check:
 	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES $(MAKE) lint types docs test
-	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.5 $(MAKE) slow
+	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.33 $(MAKE) slow
 	$(MAKE) processors RUNS="Prescott:fast Sandybridge:linear SkylakeX:linear"
 
 lint: $(VENV)/dev

@@ -47,7 +47,8 @@ if TYPE_CHECKING:
 gc.set_threshold(200_000, 50, 50)
 
 # A loaded computer fails no test; `make test` tries fewer cases than all tests together, and always the same ones.
-hypothesis.settings.register_profile("untimed", deadline=None, max_examples=200)
+SHARE = float(os.environ.get("SHARE", "1"))  # of the cases of each longer test that are run, at least one
+hypothesis.settings.register_profile("untimed", deadline=None, max_examples=round(200 * SHARE))
 hypothesis.settings.register_profile("fast", deadline=None, max_examples=30, derandomize=True)
 
 os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
@@ -82,9 +83,6 @@ def pytest_report_header(config: pytest.Config) -> str | None:
         return None
     whole = "" if SHARE == 1 else f"{SHARE:.0%} of the cases of each longer test (SHARE), "
     return f"{whole}cases drawn with --hypothesis-seed={seed}"
-
-
-SHARE = float(os.environ.get("SHARE", "1"))  # of the cases of each longer test that are run, at least one
 
 
 def undrawn_cases(items: list[pytest.Item], seed: int | None) -> set[str]:
