@@ -45,7 +45,7 @@ def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
             session.close()
 
 
-def wait(is_so: Callable[[], Any], seconds: float = 600.0) -> Any:
+def wait(is_so: Callable[[], Any], seconds: float = 180.0) -> Any:
     """Wait until a condition holds, and return what it gave."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
@@ -54,6 +54,17 @@ def wait(is_so: Callable[[], Any], seconds: float = 600.0) -> Any:
             return found
         time.sleep(0.05)
     raise AssertionError(f"not so after {seconds:g} s")
+
+
+def stand_still(browser: Any) -> None:
+    """Wait until all has come that follows a design: what comes moves what is below, and a pointer misses it."""
+    seen = [""] * 10
+
+    def is_still() -> bool:
+        seen.append(str(browser.execute_script("return document.querySelector('#page').innerHTML")))
+        return len(set(seen[-10:])) == 1
+
+    wait(is_still)
 
 
 def find(browser: Any, selector: str) -> Any:
@@ -143,6 +154,7 @@ def test_while_a_slider_is_dragged_axes_stand_still_and_old_values_are_grey(page
     """Between input events and the change that ends them; the design of the beginning is a thin line."""
     ticks = "return [...document.querySelectorAll('.card.load .tick')].map((one) => one.textContent).join()"
     wait(lambda: page.find_elements("css selector", ".requirements .light.true"))
+    stand_still(page)
     slider, _ = row(page, "stiffness")
     place = round(0.9 * float(slider.get_attribute("value")))
     began, version = (
@@ -152,7 +164,7 @@ def test_while_a_slider_is_dragged_axes_stand_still_and_old_values_are_grey(page
     move = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event(arguments[2], {bubbles: true}));"
     page.execute_script(move, slider, place, "input")
     wait(lambda: page.execute_script("return document.querySelector('#page').dataset.version") != version)
-    assert page.find_elements("css selector", ".card.load .line.faint")
+    wait(lambda: page.find_elements("css selector", ".card.load .line.faint"))  # with its part, which may follow
     assert page.execute_script(ticks) == began
     old = page.find_elements("css selector", ".requirements .light.old")
     assert old
@@ -436,7 +448,8 @@ def test_a_handle_is_dragged_and_what_cannot_be_had_is_said(page: Any) -> None:
     from selenium.webdriver import ActionChains
 
     click(page, "L")
-    handle = wait(lambda: find(page, ".card.sensitivity .handle"))
+    stand_still(page)
+    handle = find(page, ".card.sensitivity .handle")
     assert handle.get_attribute("aria-label") == "crossover of x"
     height = page.execute_script(
         "return document.querySelector('.card.sensitivity').getBoundingClientRect().top"
