@@ -299,7 +299,7 @@ def gang_table(found: LoopReport) -> Table:
     <BLANKLINE>
      sensor    |S|    |T|   from force |SP| [µm/N]   to force |FS| [N/µm]
      ────────────────────────────────────────────────────────────────────
-     y        1.57   1.72                    430.5                0.03437
+     y        1.57   1.72                    430.5                0.03418
     <BLANKLINE>
     """
     outputs, forces_of = found.plant.outputs, found.plant.inputs
