@@ -1,6 +1,6 @@
 # make design   set up ./.venv and run the main job: every design, verified, exported, simulated, reported
 # make test     set up ./.venv and run the tests that take seconds
-# make slow     the tests that take longer; SHARE=0.5: half of the cases of each, drawn anew each time
+# make slow     the tests that take longer; SHARE=0.5: half of them, drawn anew each time
 # make processors   the tests with other kernels of OpenBLAS, and features of numpy, than this processor's own
 # make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
 # make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
@@ -50,10 +50,10 @@ mutants: $(VENV)/dev
 	PYTHONPATH=tests $(BIN)/python -m mutants
 
 # With the kernels that OpenBLAS chooses itself, then with others: an old processor's, and where there is AVX-512 its own.
-# Of the longer tests a third of the cases, to end within 90 minutes on a loaded computer: `make slow` runs all.
+# Half of the longer tests, drawn anew each time, to end within 90 minutes on a loaded computer: `make slow` runs all.
 check:
 	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES $(MAKE) lint types docs test
-	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.33 $(MAKE) slow
+	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.5 $(MAKE) slow
 	$(MAKE) processors RUNS="Prescott:fast Sandybridge:linear SkylakeX:linear"
 
 lint: $(VENV)/dev

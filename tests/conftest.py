@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 gc.set_threshold(200_000, 50, 50)
 
 # A loaded computer fails no test; `make test` tries fewer cases than all tests together, and always the same ones.
-SHARE = float(os.environ.get("SHARE", "1"))  # of the cases of each longer test that are run, at least one
+SHARE = float(os.environ.get("SHARE", "1"))  # of the longer tests of each file that are run
 hypothesis.settings.register_profile("untimed", deadline=None, max_examples=round(200 * SHARE))
 hypothesis.settings.register_profile("fast", deadline=None, max_examples=30, derandomize=True)
 
@@ -81,19 +81,19 @@ def pytest_report_header(config: pytest.Config) -> str | None:
     seed = config.option.hypothesis_seed
     if seed is None:
         return None
-    whole = "" if SHARE == 1 else f"{SHARE:.0%} of the cases of each longer test (SHARE), "
+    whole = "" if SHARE == 1 else f"{SHARE:.0%} of the longer tests (SHARE), "
     return f"{whole}cases drawn with --hypothesis-seed={seed}"
 
 
-def undrawn_cases(items: list[pytest.Item], seed: int | None) -> set[str]:
-    """Cases of the longer tests that are left out, the same ones by every worker."""
-    cases: dict[str, list[str]] = {}
+def undrawn_tests(items: list[pytest.Item], seed: int | None) -> set[str]:
+    """The longer tests that are left out, the same ones by every worker; of each file one at least is run."""
+    files: dict[str, list[str]] = {}
     for item in items:
-        if item.get_closest_marker("slow") and "[" in item.nodeid:
-            cases.setdefault(item.nodeid.partition("[")[0], []).append(item.nodeid)
+        if item.get_closest_marker("slow"):
+            files.setdefault(item.nodeid.partition("::")[0], []).append(item.nodeid)
     draw = random.Random(seed)
-    kept = {name for names in cases.values() for name in draw.sample(names, math.ceil(SHARE * len(names)))}
-    return {name for names in cases.values() for name in names} - kept
+    kept = {name for names in files.values() for name in draw.sample(names, math.ceil(SHARE * len(names)))}
+    return {name for names in files.values() for name in names} - kept
 
 
 UNKNOWN_CASES = pytest.StashKey[
@@ -113,7 +113,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if case.removesuffix("]") in mark.args:
                 item.add_marker(pytest.mark.slow)
     config.stash[UNKNOWN_CASES] = named - known
-    left = undrawn_cases(items, config.option.hypothesis_seed) if SHARE < 1 else set()
+    left = undrawn_tests(items, config.option.hypothesis_seed) if SHARE < 1 else set()
     config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left])
     items[:] = [item for item in items if item.nodeid not in left]
     items.sort(key=lambda item: item.get_closest_marker("first") is None)

@@ -164,7 +164,9 @@ def test_while_a_slider_is_dragged_axes_stand_still_and_old_values_are_grey(page
     move = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event(arguments[2], {bubbles: true}));"
     page.execute_script(move, slider, place, "input")
     wait(lambda: page.execute_script("return document.querySelector('#page').dataset.version") != version)
-    wait(lambda: page.find_elements("css selector", ".card.load .line.faint"))  # with its part, which may follow
+    wait(
+        lambda: page.find_elements("css selector", ".card.load .line.faint")
+    )  # with its part, which may follow
     assert page.execute_script(ticks) == began
     old = page.find_elements("css selector", ".requirements .light.old")
     assert old

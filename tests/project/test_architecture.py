@@ -273,19 +273,16 @@ def test_slow_cases_exist(request: pytest.FixtureRequest) -> None:
     assert request.config.stash[UNKNOWN_CASES] == set()
 
 
-def test_a_share_of_the_slow_cases_is_drawn_by_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By each worker the same, of every test one at least, and none of the fast tests is left out."""
+def test_a_share_of_the_slow_tests_is_drawn_by_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By each worker the same, of every file one at least, and none of the fast tests is left out."""
 
     def item(name: str, *, slow: bool = True) -> Any:
         return SimpleNamespace(nodeid=name, get_closest_marker=lambda _: slow)
 
-    items = [item(f"a.py::test_a[{k}]") for k in range(10)] + [
-        item("a.py::test_one[x]"),
-        item("a.py::test_b"),
-    ]
+    items = [item(f"a.py::test_a[{k}]") for k in range(10)] + [item("b.py::test_one")]
     items += [item(f"a.py::test_fast[{k}]", slow=False) for k in range(10)]
     monkeypatch.setattr(conftest, "SHARE", 0.25)
-    left = [conftest.undrawn_cases(items, seed) for seed in (1, 1, 2)]
+    left = [conftest.undrawn_tests(items, seed) for seed in (1, 1, 2)]
     assert left[0] == left[1] != left[2]
     assert [len(one) for one in left] == [7, 7, 7]
     assert all(name.startswith("a.py::test_a[") for name in left[0])
