@@ -12,6 +12,7 @@ import random
 import re
 import secrets
 import shutil
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -55,6 +56,8 @@ os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have
 # Of the make that runs the tests: a make inside one of them would say which folder it enters.
 for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS"):
     os.environ.pop(_name, None)
+# A shell in the background ignores Ctrl-C, and so would all programs whose end by it is tested.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
 
