@@ -56,6 +56,7 @@ from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import Parameters
+from malta.model.plant import Plant
 from malta.model.signals import Coordinates, Signal
 from malta.synthesis.schedule import Schedule
 
@@ -380,3 +381,12 @@ def given_law(caller: str, law: Any) -> Controller:
     if not isinstance(law, Controller):
         raise InputError(caller, "controller", describe_value(law), "a Controller, as malta.gains.read gives")
     return law
+
+
+def require_law_of(caller: str, law: Controller, plant: Plant) -> None:
+    """Raise InputError for a law that reads or commands other signals than a machine has."""
+    for own, of_plant in ((law.measurements, plant.outputs), (law.forces, plant.inputs)):
+        names, wanted = ([s.name for s in signals] for signals in (own, of_plant))
+        if names != wanted:
+            expected = f"one of the {plant.name}, {' '.join(wanted)}"
+            raise InputError(caller, "controller", f"one of {' '.join(names)}", expected)
