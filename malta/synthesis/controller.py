@@ -383,10 +383,15 @@ def given_law(caller: str, law: Any) -> Controller:
     return law
 
 
-def require_law_of(caller: str, law: Controller, plant: Plant) -> None:
-    """Raise InputError for a law that reads or commands other signals than a machine has."""
-    for own, of_plant in ((law.measurements, plant.outputs), (law.forces, plant.inputs)):
+def require_law_of(caller: str, law: Controller, plant: Plant, *, by_name: bool = True) -> None:
+    """Raise InputError for a law that reads or commands other signals than a machine has.
+
+    by_name : False: signals without a name of their own, y1 y2 and u1 u2, may be those of any law with as many
+    """
+    sides = (("y", law.measurements, plant.outputs), ("u", law.forces, plant.inputs))
+    for letter, own, of_plant in sides:
         names, wanted = ([s.name for s in signals] for signals in (own, of_plant))
-        if names != wanted:
+        unnamed = not by_name and wanted == [f"{letter}{k + 1}" for k in range(len(names))]
+        if names != wanted and not unnamed:
             expected = f"one of the {plant.name}, {' '.join(wanted)}"
             raise InputError(caller, "controller", f"one of {' '.join(names)}", expected)

@@ -207,7 +207,7 @@ def _model_and_controller(
         found = "no controller" if controller is None else "two controllers"
         raise InputError("verify", "", found, "a gain file, a controller, or a machine and its controller")
     plant, controller = given_plant("verify", loop), given_law("verify", controller)
-    require_law_of("verify", controller, plant)
+    require_law_of("verify", controller, plant, by_name=False)
     if isinstance(loop, LinearModel):
         return loop, controller
     return linearize(plant, plant.point(controller.operating_point[0])), controller
