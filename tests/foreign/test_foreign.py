@@ -8,6 +8,7 @@ read late.
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -227,6 +228,15 @@ def test_a_margin_of_system_and_law_is_that_of_the_loop_with_its_late_sensors(
     pair = malta.robust_margin(malta.uncertain(spec.plant, [*box]), law, box)
     assert whole.lower is not None
     assert pair.lower == pytest.approx(whole.lower, rel=2e-3)
+
+
+def test_curves_and_loops_that_were_looked_at_are_pickled() -> None:
+    """As they are handed to other processes."""
+    spec, law = _law("disk")
+    curves, loop = malta.loops.loop_curves(spec.plant, law), malta.loop(spec.plant, law)
+    assert loop.classical.gang
+    again, _ = pickle.loads(pickle.dumps((curves, loop)))
+    assert np.array_equal(again.responses.S, curves.responses.S)
 
 
 def test_a_law_of_another_machine_is_refused() -> None:
