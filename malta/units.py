@@ -48,7 +48,8 @@ bar = 1e5 * pascal
 liter = 1e-3 * meter ** 3 = l = litre
 percent = 0.01
 """
-FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad", "V": "mV", "K": "mK"}  # units of deviations
+# Units of deviations.
+FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad", "V": "mV", "A": "mA", "T": "mT", "K": "mK"}
 
 
 @cache

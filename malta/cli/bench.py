@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -32,6 +33,7 @@ from malta.cli.options import (
 from malta.cli.output import make_console, print_document, print_note, print_text, print_written, progress_on
 from malta.errors import CheckError, InputError
 from malta.files import PICTURES
+from malta.units import FINE_UNITS, in_unit
 from malta.writing import replace_files
 
 if TYPE_CHECKING:
@@ -122,7 +124,7 @@ def measure(
     _require_no(of, "--of without --response")
     if plan:
         _require_no(logs, "a log beside --plan")
-        sizes = {} if motion is None else read_assignments("--motion", [f"motion={motion}"], {"motion": "m"})
+        sizes = {} if motion is None else _read_motion(motion, controller)
         wide = None if width is None else read_assignments("--width", [f"width={width}"], {"width": "1"})
         _plan(
             gains, controller, sizes | {"band": read_band(band), "lines": lines},
@@ -239,6 +241,15 @@ def _print_measurement(found: Measurement, files: list[Path]) -> None:
     print_written(console, files)
 
 
+def _read_motion(text: str, controller: Controller) -> dict[str, float]:
+    """The option of `malta.excite` that `--motion` gives, in the unit of what moves."""
+    from malta.identification.excite import motion_unit
+    from malta.model.plants import plant_of
+
+    unit = motion_unit(plant_of(controller.parameters))
+    return read_assignments("--motion", [f"motion={text}"], {"motion": unit})
+
+
 def _plan(
     gains: Path,
     controller: Controller,
@@ -249,6 +260,7 @@ def _plan(
     as_json: bool,
 ) -> None:
     """Print what will be flown, how, and what it will tell."""
+    from malta.identification.excite import motion_unit
     from malta.identification.measure import plan_measurement
     from malta.loops.loop import loop
     from malta.model.plants import plant_of
@@ -269,7 +281,11 @@ def _plan(
     )
     console.print(excitation_tables(first, plant)[0])
     console.print(measurement_plan_table(found))
-    size = f" --motion {1e6 * options['motion']:g}um" if "motion" in options else ""
+    size = ""
+    if "motion" in options:
+        unit = motion_unit(plant)
+        fine, largest = FINE_UNITS.get(unit, unit), options["motion"]
+        size = f" --motion {quote(f'{in_unit(largest, fine):g}{fine}')}"
     if options["band"] is not None:
         size += " --band {:g}..{:g}".format(*options["band"])
     for k in range(len(found.excitations)):

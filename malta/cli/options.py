@@ -56,7 +56,8 @@ SCENARIO_FIELDS: Mapping[str, GeneralOption] = {
     "accuracy": GeneralOption(0.0, "wanted integration error, in m or rad; 1e-9 without it"),
 }
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
-EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
+SHARES = "20% or m=10%"
+EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": SHARES, "--uncertain": SHARES}  # in errors of these
 EXAMPLE = "gain_x1=0.02 or offset_y2=5um"  # of the others
 
 
@@ -130,6 +131,11 @@ def read_shares(
     from malta.model.plants import plant_of
     from malta.model.printed import published_figures
 
+    for text in texts or ():
+        value = text.partition("=")[2] if "=" in text else text
+        if re.fullmatch(NUMBER, value.strip()) is None or any(sign in value for sign in ("=", "..")):
+            expected = f"a share, either way, as {SHARES}; for several parameters the option several times"
+            raise InputError(option, "", repr(text), expected)
     named = [text for text in texts or () if "=" in text]
     general = [text for text in texts or () if "=" not in text]
     if len(general) > 1:

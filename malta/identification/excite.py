@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from malta.arguments import describe
+from malta.arguments import describe, is_number
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError
@@ -126,7 +126,7 @@ def excite(
     current : largest current beside the one at rest, A; where no size is given 10 % of its limit, and commands within
         half of the force limits, and what the machine's curvature adds at the lines within 100 deviations of the noise
     motion : largest deviation of any output in m or rad, or of any at all where all have one unit, SI; of several
-        limits the strictest counts
+        limits the strictest counts, and commands stay within the force limits
     period : s; None: by the band
     periods : that are logged
     band : Hz, lowest and highest line; None: by the loop
@@ -162,16 +162,16 @@ def excite(
     limit = np.array(plant.actuator.force_limit)
     size = np.where(np.isfinite(limit), limit, 1.0)  # N or N m, of the unit signal
     share = np.minimum(limit, np.inf if force is None else force) / size
-    limits: list[tuple[Any, float]] = []
     by_default = force is None and current is None and motion is None
     unit = replace(signal, amplitude=(size / signal.peak)[signal.axis.astype(int)])
     model = model_at(loop, (*parameters,) or candidates(plant))
     found = predicted_spectra(loop, model, unit)
     axis = unit.axis.astype(int)
+    kept, least = (COMMAND, COMMAND / 2) if by_default else (1.0, 0.01)  # of limits, which cut commands off
+    room = np.maximum(kept * limit - np.abs(np.asarray(_rest_point(loop).v)), least * limit)
+    limits = [(found.v / room, 1.0)] if np.isfinite(limit).any() else []
     if by_default:
         current = CURRENT * plant.actuator.current_limit
-        room = COMMAND * limit - np.minimum(np.abs(np.asarray(_rest_point(loop).v)), COMMAND / 2 * limit)
-        limits = [(found.v / room, 1.0)]
     moved = slice(None) if motion is None else _moving_outputs(plant)
     sizes = ((found.i, current), (found.y[:, moved], motion))
     limits += [(part, most) for part, most in sizes if most is not None and np.isfinite(most)]
@@ -383,8 +383,8 @@ def _require(
 ) -> tuple[float, float]:
     """The band, by default that of the loop. Raises InputError for what no excitation can be."""
     for name, value in {**sizes, **counts}.items():
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError("excite", name, str(value), "a number above 0")
+        if value is not None and not (is_number(value) and value > 0):
+            raise InputError("excite", name, describe(value), "a number above 0")
     if not loop.stable:
         raise InputError("excite", "loop", "an unstable one", "a loop that holds its machine")
     nyquist = 0.5 / loop.sample_time

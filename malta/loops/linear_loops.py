@@ -224,6 +224,10 @@ class LinearLoop:
         found = found[np.abs(z) > DELAY_POLE_SIZE]
         return np.asarray(np.log1p(T * found) / T)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What pickle keeps: functions of frequency are made anew."""
+        return {key: value for key, value in vars(self).items() if key != "responses"}
+
     @cached_property
     def responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
         """The functions of frequency of the plant and of the law, see `System.response`."""

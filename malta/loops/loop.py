@@ -35,7 +35,7 @@ from malta.model.parameters import units_of
 from malta.model.places import position_at
 from malta.model.plant import Plant, given_plant
 from malta.model.traced import with_parameters
-from malta.synthesis.controller import Controller, given_law
+from malta.synthesis.controller import Controller, given_law, require_law_of
 from malta.synthesis.law import law_at
 
 
@@ -235,9 +235,7 @@ def loop(
     chosen_loops(plant, controller, current_loops)
     require_known(parameters or (), units_of(plant.parameters), "loop", found="an unknown parameter")
     machine = with_parameters(plant, replace(plant.parameters, **parameters)) if parameters else plant
-    names = [s.name for s in controller.measurements]
-    if names != [s.name for s in plant.outputs]:
-        raise InputError("loop", "controller", f"one of {' '.join(names)}", f"one of the {plant.name}")
+    require_law_of("loop", controller, plant)
     x = plant.state(at) if at else plant.point(design).x
     return _cached_loop(machine, controller, tuple(position_at(plant, x).items()), current_loops)
 
@@ -250,6 +248,7 @@ def loop_of_model(model: LinearModel, controller: Controller) -> Loop:
 
 def loop_along(plant: Plant, controller: Controller, position: float | None = None) -> Loop:
     """The loop at a position of the stroke, m; None: at the controller's operating point."""
+    require_law_of("loop", controller, plant)
     at = position_at(plant, plant.point(controller.operating_point[0]).x)
     if position is not None and plant.has_stroke:
         at[plant.stroke.name] = position

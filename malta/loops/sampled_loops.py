@@ -117,6 +117,10 @@ class SampledLoop:
         """The loop cut at its sensors: what peaks and crossings are read from."""
         return Nominal(*self.systems, self.spectral_radius < 1, self.sample_time)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What pickle keeps: functions of frequency are made anew."""
+        return {key: value for key, value in vars(self).items() if key != "_responses"}
+
     @cached_property
     def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
         P, F = self.systems

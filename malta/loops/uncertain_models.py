@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 from malta.errors import require_known
@@ -17,13 +18,13 @@ def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
 
         E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u
 
-    source : a Plant, which is linearized with these parameters; a function of the parameters by name (or of one array
-        p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a casadi.Function of p; or
-        matrices A0, B0, C0[, D0[, E0]]
+    source : a Plant, which is linearized with these parameters and read by its sensors; a function of the parameters
+        by name (or of one array p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a
+        casadi.Function of p; or matrices A0, B0, C0[, D0[, E0]]
     names : of a Plant the names of its parameters; else their nominal values by name, SI
-    options : of a Plant `x`, the states to linearize at; of the others `terms`, the factors of each parameter beside
-        matrices, as {"k": (A1, B1, C1)}; `limits` (above, below) of parameters; `sample_time` (s) of matrices that give
-        x+ in place of x'
+    options : of a Plant `at`, the states that are not zero, and `late`, False for readings before the lags of its
+        sensors; of the others `terms`, the factors of each parameter beside matrices, as {"k": (A1, B1, C1)}; `limits`
+        (above, below) of parameters; `sample_time` (s) of matrices that give x+ in place of x'
 
     Returns an UncertainSystem.
 
@@ -36,7 +37,9 @@ def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
     >>> system.names
     ('J', 'b')
     """
-    made = of_plant if isinstance(source, Plant) else from_source
+    made: Callable[..., UncertainSystem] = from_source
+    if isinstance(source, Plant):  # its readings come behind the lags of its sensors, as those of its loop
+        made, options = of_plant, {"late": not options.get("states"), **options}
     known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
     require_known(options, known, "uncertain", found="an unknown option")
     return made(source, names, **options)

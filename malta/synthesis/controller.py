@@ -56,6 +56,7 @@ from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import Parameters
+from malta.model.plant import Plant
 from malta.model.signals import Coordinates, Signal
 from malta.synthesis.schedule import Schedule
 
@@ -380,3 +381,17 @@ def given_law(caller: str, law: Any) -> Controller:
     if not isinstance(law, Controller):
         raise InputError(caller, "controller", describe_value(law), "a Controller, as malta.gains.read gives")
     return law
+
+
+def require_law_of(caller: str, law: Controller, plant: Plant, *, by_name: bool = True) -> None:
+    """Raise InputError for a law that reads or commands other signals than a machine has.
+
+    by_name : False: signals without a name of their own, y1 y2 and u1 u2, may be those of any law with as many
+    """
+    sides = (("y", law.measurements, plant.outputs), ("u", law.forces, plant.inputs))
+    for letter, own, of_plant in sides:
+        names, wanted = ([s.name for s in signals] for signals in (own, of_plant))
+        unnamed = not by_name and wanted == [f"{letter}{k + 1}" for k in range(len(names))]
+        if names != wanted and not unnamed:
+            expected = f"one of the {plant.name}, {' '.join(wanted)}"
+            raise InputError(caller, "controller", f"one of {' '.join(names)}", expected)

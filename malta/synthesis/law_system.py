@@ -11,6 +11,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import balanced_units
+from malta.linear.sampling import whole_or_not
 from malta.model.machines import build_plant
 from malta.model.places import outputs_at
 from malta.synthesis.controller import Controller
@@ -40,7 +41,7 @@ def law_system(c: Controller) -> Any:
 
 
 def compensator_fields(c: Controller) -> dict[str, Any]:
-    """The fields of the compensator that a proof has for the law: with hold, the actuator's delay, and its lag.
+    """The fields of the compensator that a proof has for the law: with hold, all delay of the machine, and its lag.
 
     Raises InputError for a law that is scheduled.
     """
@@ -48,11 +49,13 @@ def compensator_fields(c: Controller) -> dict[str, Any]:
         raise InputError(
             c.name, "compensator", "a scheduled law", "a law of one set of gains, or a malta.loop"
         )
-    law, actuator = linear_law(c), build_plant(c.parameters).actuator
+    law, plant = linear_law(c), build_plant(c.parameters)
+    actuator = plant.actuator
     lag = float(actuator.crossover) if math.isfinite(actuator.crossover) else None
     sums = 0 if c.observed else len(c.summed)
     Ts = c.sample_time
-    held = {"sample_time": Ts, "delay": actuator.delay(Ts), "lag": lag}
+    delay = whole_or_not(actuator.delay(Ts) + plant.sensors.dead_time / Ts)  # of readings: as one of forces
+    held = {"sample_time": Ts, "delay": delay, "lag": lag}
     return {"A": law.A, "B": law.B_y, "C": law.C, "D": law.D_y, "integrals": sums, **held}
 
 

@@ -30,6 +30,7 @@ from typing import Any, get_args
 import numpy as np
 from scipy import linalg
 
+from malta.arguments import describe, is_number
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.matrices import add_integrals, eigenvalues, system_matrix
@@ -144,8 +145,8 @@ def lqg(
     >>> malta.verify(model, controller).stable, [f"{k:.3g}" for k in controller.K[0]]
     (True, ['1.29e+03', '35.8'])
     """
-    if not (math.isfinite(Ts) and Ts > 0):
-        raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
+    if not (is_number(Ts) and Ts > 0):
+        raise InputError("lqg", "Ts", f"{describe(Ts)} s", "a sample time above 0 s")
     model = linear_model_of(model, "lqg")
     if model.operating_point.loaded:
         raise InputError(

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from malta.arguments import require_real
+from malta.arguments import describe, require_real
 from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
@@ -169,7 +169,12 @@ def weights(
 
 
 def _diagonal(name: str, value: ArrayLike) -> FloatArray:
-    found: FloatArray = np.atleast_1d(np.asarray(require_real("weights", name, value), dtype=float))
+    real = require_real("weights", name, value)
+    try:
+        found: FloatArray = np.atleast_1d(np.asarray(real, dtype=float))
+    except (TypeError, ValueError) as error:
+        expected = "a vector or a diagonal matrix of numbers"
+        raise InputError("weights", name, describe(value), expected) from error
     if found.ndim == 1:
         return found
     if found.ndim != 2 or found.shape[0] != found.shape[1] or np.any(found - np.diag(np.diag(found))):

@@ -25,7 +25,7 @@ from malta.model.plants import plant_of
 from malta.model.soundness import unproven
 from malta.proof.margin import Progress, Ranges
 from malta.simulation.experiments.payloads import payload
-from malta.synthesis.controller import Controller, given_law
+from malta.synthesis.controller import Controller, given_law, require_law_of
 from malta.synthesis.requirements import Payload
 from malta.tuning.outcomes import entries_without_flights, judge_controller, open_entries
 from malta.work import NO_TIME, WorkUp, is_stopped, without_limit
@@ -206,7 +206,8 @@ def _model_and_controller(
     if isinstance(loop, Controller) or controller is None:
         found = "no controller" if controller is None else "two controllers"
         raise InputError("verify", "", found, "a gain file, a controller, or a machine and its controller")
-    if isinstance(loop, LinearModel):
-        return loop, given_law("verify", controller)
     plant, controller = given_plant("verify", loop), given_law("verify", controller)
+    require_law_of("verify", controller, plant, by_name=False)
+    if isinstance(loop, LinearModel):
+        return loop, controller
     return linearize(plant, plant.point(controller.operating_point[0])), controller

@@ -169,7 +169,12 @@ def test_options_of_the_run_reach_it(run: Run, tmp_path: Path) -> None:
 
 
 REFUSED: dict[str, tuple[tuple[str, ...], str]] = {
-    "no share": (("--spread", "wide"), "--spread: found 'all=wide', expected NAME=VALUE, as 20% or m=10%"),
+    "no share": (
+        ("--spread", "wide"),
+        "--spread: found 'wide', expected a share, either way, as 20% or m=10%",
+    ),
+    "an interval": (("--spread", "m=1..2"), "--spread: found 'm=1..2', expected a share, either way"),
+    "two in one": (("--spread", "m=5% K_A=2%"), "for several parameters the option several times"),
     "two shares": (
         ("--spread", "10%", "--spread", "20%"),
         "--spread: found 10% and 20%, expected one share for all",

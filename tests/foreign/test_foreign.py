@@ -8,6 +8,7 @@ read late.
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -153,13 +154,14 @@ def test_each_case_of_a_table_stands_in_its_unit() -> None:
     """A step of a temperature in K, and one of a reading of milliamperes: nothing is 0 but what is."""
     spec, law = _law("hybrid")
     text = printed(malta.report.experiment_table(malta.experiment("step", spec.plant, law, time=0.2)))
-    assert [line.split()[-1] for line in text.splitlines() if "left at the end [A]" in line] != ["0"]
+    assert [line.split()[-1] for line in text.splitlines() if "left at the end [mA]" in line] != ["0"]
     assert "left at the end [mK]" in text
     held = malta.experiment("hold", spec.plant, law, time=0.2)
     (row,) = [
         line for line in printed(malta.report.experiment_table(held)).splitlines() if "y_q, rms" in line
     ]
-    assert 0 < float(row.split()[-1]) < 5e-6
+    assert "y_q, rms [mA]" in row
+    assert 0 < float(row.split()[-1]) < 5e-3
 
 
 @pytest.mark.slow
@@ -206,6 +208,48 @@ def test_a_motion_is_one_of_outputs_that_move(
     gains = _gains("spindle", folder, monkeypatch)
     assert run("excite", gains, "--motion", "20mV", "--json").code == 0
     assert "expected a unit of V" in run("excite", gains, "--motion", "20um").err
+    planned = run("measure", gains, "--plan", "--motion", "0.02V")
+    assert (planned.code, " --motion 20mV --log" in planned.out) == (0, True)
+    assert "expected a unit of V" in run("measure", gains, "--plan", "--motion", "20um").err
+
+
+def test_a_motion_that_no_command_reaches_ends_at_the_limits() -> None:
+    """A valve of 10 V is not asked for more: what is cut off is none of the linear loop's."""
+    spec, law = _law("car")
+    assert max(malta.excite(malta.loop(spec.plant, law), motion=10.0).command.values()) < 1.0 + 1e-6
+
+
+@pytest.mark.parametrize(("name", "box"), [("car", {"m_s": 0.2}), ("spindle", {"C": 0.1})])
+def test_a_margin_of_system_and_law_is_that_of_the_loop_with_its_late_sensors(
+    name: str, box: dict[str, float]
+) -> None:
+    spec, law = _law(name)
+    whole = malta.robust_margin(malta.loop(spec.plant, law), box)
+    pair = malta.robust_margin(malta.uncertain(spec.plant, [*box]), law, box)
+    assert whole.lower is not None
+    assert pair.lower == pytest.approx(whole.lower, rel=2e-3)
+
+
+def test_curves_and_loops_that_were_looked_at_are_pickled() -> None:
+    """As they are handed to other processes."""
+    spec, law = _law("disk")
+    curves, loop = malta.loops.loop_curves(spec.plant, law), malta.loop(spec.plant, law)
+    assert loop.classical.gang
+    again, _ = pickle.loads(pickle.dumps((curves, loop)))
+    assert np.array_equal(again.responses.S, curves.responses.S)
+
+
+def test_a_law_of_another_machine_is_refused() -> None:
+    """Readings and commands of a law are those of the machine, wherever both are given."""
+    plant, law = _law("car")[0].plant, _law("maglev")[1]
+    said = "found one of y_G y_B a, expected one of the car, y_d a_s a_u"
+    for asked in (
+        lambda: malta.verify(plant, law),
+        lambda: malta.verify(malta.linearize(plant, plant.at()), law),
+        lambda: malta.loops.loop_curves(plant, law),
+    ):
+        with pytest.raises(malta.InputError, match=said):
+            asked()
 
 
 @pytest.mark.slow

@@ -272,11 +272,23 @@ def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
         ({"periods": 10**9}, "samples of all, expected at most 5e.07"),
         ({"band": (400.0, 2.0)}, "band: found 400 to 2 Hz, expected rising"),
         ({"motion": -1e-6}, "motion: found -1e-06, expected a number above 0"),
+        ({"motion": "20um"}, "motion: found '20um', expected a number above 0"),
+        ({"force": 1j}, "force: found 1j, expected a number above 0"),
     ],
 )
 def test_an_excitation_that_cannot_be_is_refused(plant: Plant, options: dict[str, Any], says: str) -> None:
     with pytest.raises(malta.InputError, match=says):
         malta.excite(malta.loop(plant, CONTROLLER), **options)
+
+
+def test_a_machine_without_limits_is_excited_by_a_size_alone() -> None:
+    """Without a size nothing says how large an excitation may be."""
+    cart = malta.linear_machine([[0, 1], [4, 0]], [[0], [1]], [[1, 0]], outputs=["y [m]"], noise=1e-6)
+    weights = malta.synthesis.weights(q=[100, 1], r=[1], w=[1], v=[1e-12], q_i=[1])
+    loop = malta.loop(cart, malta.lqg(malta.linearize(cart, cart.at()), weights, Ts=1e-2))
+    with pytest.raises(malta.InputError, match="none, and a machine without limits, expected a force"):
+        malta.excite(loop)
+    assert malta.excite(loop, motion=1e-3).motion["y"] == pytest.approx(1e-3)
 
 
 def test_estimates_at_the_lines_and_in_time_agree(found: Identified) -> None:

@@ -120,6 +120,8 @@ def test_arguments_are_checked(model: LinearModel, designs: dict[str, Design]) -
         malta.lqg(model, weights, 0.0)
     with pytest.raises(malta.InputError, match="Ts"):
         malta.lqg(model, weights, float("nan"))
+    with pytest.raises(malta.InputError, match="Ts: found '50us' s, expected a sample time above 0 s"):
+        malta.lqg(model, weights, "50us")  # type: ignore[arg-type]
     with pytest.raises(malta.InputError, match="delay"):
         malta.lqg(model, weights, 50e-6, "backward-euler", 1)
     with pytest.raises(malta.InputError, match="delay"):
@@ -138,6 +140,10 @@ def test_weights_refuse_what_is_no_weight(designs: dict[str, Design]) -> None:
             replace(weights, **{field: np.full(len(getattr(weights, field)), value)})  # type: ignore[arg-type]
     with pytest.raises(malta.InputError, match="bases"):
         replace(weights, q_base=weights.q_base[:4])
+    with pytest.raises(malta.InputError, match="weights: r: found 'small', expected a vector"):
+        malta.synthesis.weights(q=[1.0], r="small", w=[1.0], v=[1.0])
+    with pytest.raises(malta.InputError, match="weights: q: found complex numbers"):
+        malta.synthesis.weights(q=[1j], r=[1.0], w=[1.0], v=[1.0])
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ and, where they differ from the defaults,
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import partial
@@ -450,7 +451,8 @@ def _expected_kind(value: Any, default: Any) -> str:
     if isinstance(default, bool):
         return "" if isinstance(value, bool) else "true or false"
     if isinstance(default, Real):
-        return "" if _is_number(value) else "a number"
+        finite = _is_number(value) and math.isfinite(value)
+        return "" if finite else "a finite number" if _is_number(value) else "a number"
     if isinstance(default, tuple):
         several = isinstance(value, tuple | list) and len(value) > 0
         return "" if several and all(map(_is_number, value)) else "numbers"
