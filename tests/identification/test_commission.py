@@ -341,3 +341,18 @@ def test_commission_from_the_shell(run: Run, tmp_path: Path, monkeypatch: pytest
     assert (said.code, document["passed"], document["left"]) == (0, True, [])
     assert document["signature"] in (tmp_path / "day" / "binder.txt").read_text()
     assert run("commission", ROBUST, "--sensor", "gain_q=1").code == 2
+
+
+@pytest.mark.parametrize(
+    ("gains", "said"),
+    [
+        ("robust", "an export with --wiring tries"),
+        ("halbach", "an export with --wiring --until currents tries"),
+        ("planar", ""),
+    ],
+)
+def test_the_plan_names_an_export_that_there_is(gains: str, said: str, run: Run) -> None:
+    """`malta export --wiring` refuses `planar`, and `halbach` down to set points."""
+    listed = " ".join(run("commission", f"design/gains/{gains}.json", "--plan").out.split())
+    assert said in listed
+    assert ("--wiring" in listed) == bool(said)
