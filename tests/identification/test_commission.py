@@ -24,6 +24,7 @@ from malta.identification.commission import (
     Check,
     StepFinding,
     commission,
+    judge_noise,
     read_journal,
     steps_of,
 )
@@ -356,3 +357,16 @@ def test_the_plan_names_an_export_that_there_is(gains: str, said: str, run: Run)
     listed = " ".join(run("commission", f"design/gains/{gains}.json", "--plan").out.split())
     assert said in listed
     assert ("--wiring" in listed) == bool(said)
+
+
+def test_a_log_at_rest_without_a_sensor_is_refused() -> None:
+    """A bench's file may lack a column: it is named."""
+    scenario = malta.Scenario("still", 0.1, malta.references.hold, noise=1.0)
+    log = malta.identification.log_of(malta.simulate(PLANT, CONTROLLER, scenario))
+    cut = replace(
+        log,
+        signals={**log.signals, "y": log.signals["y"][:3]},
+        columns={**log.columns, "y": log.columns["y"][:, :3]},
+    )
+    with pytest.raises(InputError, match="y2: found no such column of y, expected one of x1 y1 x2"):
+        judge_noise(CONTROLLER, cut)

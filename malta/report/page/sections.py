@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
 
 CURVE_TOLERANCE = 1e-3  # relative difference of curves that a plot does not show
+SAME_POLE = 0.02  # of the fastest pole: difference that a map does not show
 
 
 class Panels(NamedTuple):
@@ -294,11 +295,23 @@ def _poles(a: Analysis) -> Iterator[Item]:
     yield Illustration(
         lambda: plots.pzmap(loops),
         "Poles of the closed loop and of the machine, and zeros of the loop gain; of sampled systems ln(z) / Ts. "
-        "The right side is the neighbourhood of the origin.",
+        "The right side is the neighbourhood of the origin." + held_currents(a),
     )
     changed = a.subject.parameters != a.subject.controller.parameters
     published = None if changed else published_figures(a.plant.name)
     yield from sheets_of([poles_table(a.report.model, published), loop_poles_table(a.report)])
+
+
+def held_currents(a: Analysis) -> str:
+    """Why poles of the machine in the map are not those of the table; "" where they are."""
+    table, drawn = np.linalg.eigvals(a.report.model.A), a.curves.poles["plant"]
+    apart = np.abs(table[:, None] - drawn[np.isfinite(drawn)][None]).min(axis=1, initial=np.inf)
+    if np.all(apart <= SAME_POLE * np.abs(table).max(initial=0.0)):
+        return ""
+    return (
+        " The machine in the map is the one in the loop, whose currents are held between readings. "
+        "The table of open-loop poles is of the linear model, whose currents follow the position."
+    )
 
 
 def _margins(a: Analysis) -> Iterator[Item]:
