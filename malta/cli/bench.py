@@ -352,13 +352,15 @@ def commission(
 
     controller = read_controller(gains, machine)
     if wiring is not None:
+        if plan or logs or step or skip or out or as_json:
+            raise InputError("--wiring", "", "other options beside it", "--wiring ADDRESS:PORT alone")
         _print_wiring(controller, wiring)
         return
     plant = plant_of(controller.parameters)
     box = content_of(gains)[0].uncertainty or {}
     steps = steps_of(plant, box)
     if plan:
-        _print_plan(steps, tries_wiring=plant.second_order)
+        _print_plan(steps, _wiring_export(controller))
         return
     folder = out or Path("build", "commission", controller.name)
     done = commission_machine(
@@ -390,15 +392,14 @@ def commission(
 
 
 def _print_wiring(controller: Controller, where: str) -> None:
-    """What a supervisor that tries its wiring has found. Raises CheckError for a mistake."""
+    """What a supervisor has found of its wiring. Raises CheckError for a mistake, and where it was not tried."""
     from malta.firmware.wiring_words import wiring_sentences
     from malta.firmware.xcp_master import xcp_master
 
     with xcp_master(where) as master:
         t, found = _read_wiring(controller, where, master)
     if found["wired"] == 0 or not any(found["shows"]):
-        print_text(make_console(), f"{where}: the wiring was not tried; set wired to 0 and request a start")
-        return
+        raise CheckError(f"{where}: the wiring was not tried; set wired to 0 and request a start")
     said = wiring_sentences(t, found)
     if said:
         raise CheckError(f"{where}: " + "; ".join(said))
@@ -426,16 +427,32 @@ def _read_wiring(controller: Controller, where: str, master: XcpMaster) -> tuple
     raise InputError(where, "", "no results of a wiring", "the slave of an export with --wiring")
 
 
-def _print_plan(steps: tuple[Check, ...], *, tries_wiring: bool) -> None:
-    """The checklist, as it stands before the first step, and whether an export can try its wiring."""
+def _wiring_export(controller: Controller) -> str:
+    """Options of an export that tries the wiring of this machine; "" where none can."""
+    from malta.firmware.export import target_of
+    from malta.firmware.wiring import wiring_table
+
+    choices: tuple[tuple[Until | None, str], ...] = (
+        (None, "--wiring"),
+        ("currents", "--wiring --until currents"),
+    )
+    for until, words in choices:
+        with suppress(InputError):
+            wiring_table(replace(target_of(controller, "double", until), wiring=True))
+            return words
+    return ""
+
+
+def _print_plan(steps: tuple[Check, ...], tries: str) -> None:
+    """The checklist, as it stands before the first step, and which export can try its wiring, if any."""
     from malta.report.tables.experiments import checklist_table
 
     console = make_console()
     console.print(checklist_table(steps))
-    if not tries_wiring:
+    if not tries:
         return
     before = (
-        "Before the first lift-off an export with --wiring tries sensors, coils and commutation at low force;"
+        f"Before the first lift-off an export with {tries} tries sensors, coils and commutation at low force;"
     )
     print_text(console, f"{before} --wiring ADDRESS:PORT says here what it has found.")
 

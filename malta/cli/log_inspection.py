@@ -61,6 +61,8 @@ def log(
               malta log scope.csv --columns x1=CH1:10um/V --gains mine.json
     """
     if live is not None:
+        if as_json or gains is not None:
+            raise InputError("--live", "", "--json or --gains beside it", "--live without them")
         _log_live(file, live, signal or [], seconds, every, baud, out)
         return
     if signal:
@@ -137,6 +139,8 @@ def _log_live(
         ]
         replace_files({out: ("\n".join([head, *rows]) + "\n").encode()})
         print_written(console, [out])
+    if found.broken:
+        raise CheckError(f"{where}: the line broke at {found.t[-1]:.6g} s; what came until then is above")
 
 
 @add_log_options

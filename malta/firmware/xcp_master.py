@@ -26,6 +26,7 @@ from malta.firmware.signals import Target
 from malta.firmware.xcp import FOUND, PACKET, WIRED, wiring_results
 
 ANSWER_TIME, TRIES = 1.0, 3  # s for an answer, and how often a request is sent
+ADDRESS = "ADDRESS:PORT with a port of 1 to 65535, as 127.0.0.1:5555, or a serial port, as /dev/ttyUSB0"
 REASONS = {
     0x20: "a command that the slave does not have",
     0x21: "a frame cut short",
@@ -183,13 +184,16 @@ def xcp_master(where: str, baud: int = 115200) -> Iterator[XcpMaster]:
     another master's.
     """
     host, _, number = where.rpartition(":")
-    if number.isdigit() and host and "/" not in where:
+    if not where or (set(where) & set(":.") and not set(where) & set("/\\")):
+        udp_port = int(number) if number.isdecimal() and len(number) < 6 else 0
+        if not host or not 0 < udp_port < 65536:
+            raise InputError("address of an XCP slave", "", repr(where), ADDRESS)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
             try:
-                s.connect((host, int(number)))
-            except (OSError, OverflowError) as error:
+                s.connect((host, udp_port))
+            except (OSError, UnicodeError) as error:  # a name that is none, or too long for one
                 found = getattr(error, "strerror", None) or str(error)
-                raise InputError(where, "", found, "ADDRESS:PORT, as 127.0.0.1:5555") from error
+                raise InputError(where, "", found, ADDRESS) from error
             with _connect(XcpMaster(_Udp(s), where)) as master:
                 yield master
         return
@@ -207,12 +211,13 @@ def _connect(master: XcpMaster) -> Iterator[XcpMaster]:
 
 
 class LiveRecord(NamedTuple):
-    """What a live log has: times (s), a column for each signal, and samples that the line lost."""
+    """What a live log has: times (s), a column for each signal, samples that the line lost, whether it broke."""
 
     t: FloatArray
     signals: tuple[LiveSignal, ...]
     values: FloatArray  # samples x signals
     lost: int
+    broken: bool = False  # the slave fell silent before the end
 
 
 def record_live(
@@ -228,7 +233,8 @@ def record_live(
 
     names : as the A2L has them; seconds : how long; show : is called with time and values of the last sample that came
 
-    Raises InputError for names that there are not, and more signals than the slave has room for.
+    Where the slave falls silent, what came until then is returned. Raises InputError for names that there are not, more
+    signals than the slave has room for, and where nothing comes at all.
 
         with xcp_master("127.0.0.1:5555") as master:
             record_live(master, read_a2l("build/robust_c/robust.a2l"), ["y_used.x1"], 1.0)
@@ -242,10 +248,13 @@ def record_live(
     rows: dict[int, dict[int, tuple[float, ...]]] = {}
     stamp, end, shown = -1, time.monotonic() + seconds, 0.0
     master.ask(b"\xdd\x01")
-    while (left := end - time.monotonic()) > 0:
+    patience = max(ANSWER_TIME * TRIES, 3 * every * a2l.sample_time)
+    heard = time.monotonic()
+    while (left := min(end, heard + patience) - time.monotonic()) > 0:
         packet = master.data.pop(0) if master.data else master.frames.receive(min(left, 0.1))
         if not packet or packet[0] >= len(tables):
             continue
+        heard = time.monotonic()
         number, head = packet[0], 5 if packet[0] == 0 else 1
         if number == 0:
             stamp = int.from_bytes(packet[1:5], "little")
@@ -260,8 +269,14 @@ def record_live(
         ):
             shown = time.monotonic()
             show(stamp * a2l.sample_time, [v for part in sorted(rows[stamp].items()) for v in part[1]])
-    master.ask(b"\xdd\x00")
-    return _record(a2l, signals, len(tables), rows, every)
+    found = _record(a2l, signals, len(tables), rows, every)
+    try:
+        master.ask(b"\xdd\x00")
+    except InputError:
+        if not len(found.t):
+            raise
+        return found._replace(broken=True)
+    return found
 
 
 def _record(

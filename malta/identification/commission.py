@@ -454,8 +454,9 @@ def stroke_step() -> Check:
 
 
 def judge_noise(controller: Controller, log: Log) -> list[StepFinding]:
-    """The noise of each position sensor beside what the gain file's machine has."""
+    """The noise of each position sensor beside the gain file's. Raises InputError for a log that lacks one."""
     plant = plant_of(controller.parameters)
+    log.table("y", [s.name for s in plant.outputs])
     found = at_rest(log)
     return [
         StepFinding(

@@ -389,8 +389,8 @@ def test_the_wiring_is_read_over_the_line(tmp_path: Path, run: Run, monkeypatch:
     assert code == 0, err
     with running(build(HERE, tmp_path / "c", main="_xcp_pc")):
         code, out, err = run("commission", str(gains), "--wiring", f"127.0.0.1:{port}")
-    assert code == 0, err
-    assert "the wiring was not tried" in out
+    assert (code, out) == (1, "")
+    assert "the wiring was not tried" in err
 
 
 class Memory:
@@ -427,17 +427,113 @@ class Memory:
 @pytest.mark.slow
 def test_the_wiring_of_any_export_is_read(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of numbers of four bytes, and of an export down to currents; another law is refused by its name."""
-    gains, law = str(ROOT / "design" / "gains" / "halbach.json"), "halbach"
+    gains, law, wired = str(ROOT / "design" / "gains" / "halbach.json"), "halbach", 1
     t = replace(target("halbach", "float"), fidelity="force", tunable=True, wiring=True)
 
     @contextmanager
     def connected(where: str) -> Iterator[XcpMaster]:
-        yield XcpMaster(Memory(law, t, {"doubt": -1, "cables": 0}), where)
+        yield XcpMaster(Memory(law, t, {"doubt": -1, "cables": 0, "wired": wired}), where)
 
     monkeypatch.setattr(xcp_master, "xcp_master", connected)
     code, _, err = run("commission", gains, "--wiring", "there:1")
     assert code == 1
     assert "there:1: " in err
+    wired = 0
+    code, out, err = run("commission", gains, "--wiring", "there:1")
+    assert (code, out) == (1, "")  # nobody takes this for wiring that is right
+    assert "the wiring was not tried" in err
     law = "other"
     code, _, err = run("commission", gains, "--wiring", "there:1")
     assert (code, err) == (2, "malta: there:1: law: found other, expected halbach, that of the gain file\n")
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "",
+        "127.0.0.1",
+        ":5556",
+        "127.0.0.1:",
+        "127.0.0.1:abc",
+        "127.0.0.1:0",
+        "127.0.0.1:65536",
+        "host:5555.5",
+    ],
+)
+def test_what_is_no_address_of_a_slave_is_not_taken_for_a_serial_port(where: str, run: Run) -> None:
+    code, out, err = run("commission", str(ROOT / "design/gains/robust.json"), "--wiring", where)
+    assert (code, out) == (2, "")
+    expected = "ADDRESS:PORT with a port of 1 to 65535, as 127.0.0.1:5555, or a serial port, as /dev/ttyUSB0"
+    assert err == f"malta: address of an XCP slave: found {where!r}, expected {expected}\n"
+
+
+@pytest.mark.parametrize("where", ["/dev/none", "./none", "COMX"])
+def test_a_serial_port_that_is_none_is_named(where: str, run: Run) -> None:
+    code, _, err = run("commission", str(ROOT / "design/gains/robust.json"), "--wiring", where)
+    assert code == 2
+    assert err.startswith(f"malta: {where}: found ")
+
+
+@pytest.mark.parametrize(
+    "option",
+    [("--plan",), ("--json",), ("--logs", "l"), ("--out", "o"), ("--step", "loop"), ("--skip", "loop")],
+)
+def test_the_wiring_is_asked_for_alone(option: tuple[str, ...], run: Run) -> None:
+    """Options that it would ignore are refused: --json promises a document."""
+    gains = str(ROOT / "design" / "gains" / "robust.json")
+    code, out, err = run("commission", gains, "--wiring", "127.0.0.1:5555", *option)
+    assert (code, out) == (2, "")
+    assert "other options beside it" in err
+
+
+class Falls:
+    """A slave that sends so many samples and then falls silent."""
+
+    def __init__(self, samples: int) -> None:
+        self.left, self.stamp, self.asked = samples, 0, b""
+
+    def send(self, packet: bytes) -> None:
+        self.asked = packet
+
+    def receive(self, seconds: float) -> bytes:
+        if self.asked and not (self.asked == b"\xdd\x00" or (self.asked == b"\xdd\x01" and self.stamp)):
+            self.asked, self.stamp = b"", self.stamp + (self.asked == b"\xdd\x01")
+            return b"\xff"
+        if self.left == 0:
+            time.sleep(min(seconds, 0.01))
+            return b""
+        self.left, self.stamp = self.left - 1, self.stamp + 1
+        return struct.pack("<BId", 0, self.stamp, 0.5)
+
+
+def test_what_a_line_gave_before_it_broke_is_kept(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The samples before a connection is lost are those that somebody looks for; it is not waited for until the end."""
+    a2l, out = tmp_path / "halbach.a2l", tmp_path / "l.csv"
+    a2l.write_text(a2l_text(slave(), "halbach"), encoding="utf-8")
+    slaves = iter((Falls(7), Falls(0)))
+
+    @contextmanager
+    def connected(where: str, _baud: int) -> Iterator[XcpMaster]:
+        yield XcpMaster(next(slaves), where)
+
+    monkeypatch.setattr(xcp_master, "xcp_master", connected)
+    monkeypatch.setattr(xcp_master, "ANSWER_TIME", 0.05)
+    command = ("log", str(a2l), "--live", "there:1", "--signal", "in.y.x", "--for", "600", "--out", str(out))
+    code, shown, err = run(*command)
+    assert code == 1
+    assert "7 samples, 0 lost" in shown
+    assert "there:1: the line broke at 0.44 s; what came until then is above" in err
+    assert len(out.read_text(encoding="utf-8").splitlines()) == 8
+    out.unlink()
+    code, _, err = run(*command)
+    assert code == 2
+    assert "found no answer" in err
+    assert not out.exists()
+
+
+def test_a_live_log_has_no_document(tmp_path: Path, run: Run) -> None:
+    code, out, err = run("log", str(tmp_path / "a.a2l"), "--live", "127.0.0.1:5555", "--json")
+    assert (code, out) == (2, "")
+    assert "--json or --gains beside it" in err

@@ -24,6 +24,7 @@ from malta.identification.commission import (
     Check,
     StepFinding,
     commission,
+    judge_noise,
     read_journal,
     steps_of,
 )
@@ -341,3 +342,31 @@ def test_commission_from_the_shell(run: Run, tmp_path: Path, monkeypatch: pytest
     assert (said.code, document["passed"], document["left"]) == (0, True, [])
     assert document["signature"] in (tmp_path / "day" / "binder.txt").read_text()
     assert run("commission", ROBUST, "--sensor", "gain_q=1").code == 2
+
+
+@pytest.mark.parametrize(
+    ("gains", "said"),
+    [
+        ("robust", "an export with --wiring tries"),
+        ("halbach", "an export with --wiring --until currents tries"),
+        ("planar", ""),
+    ],
+)
+def test_the_plan_names_an_export_that_there_is(gains: str, said: str, run: Run) -> None:
+    """`malta export --wiring` refuses `planar`, and `halbach` down to set points."""
+    listed = " ".join(run("commission", f"design/gains/{gains}.json", "--plan").out.split())
+    assert said in listed
+    assert ("--wiring" in listed) == bool(said)
+
+
+def test_a_log_at_rest_without_a_sensor_is_refused() -> None:
+    """A bench's file may lack a column: it is named."""
+    scenario = malta.Scenario("still", 0.1, malta.references.hold, noise=1.0)
+    log = malta.identification.log_of(malta.simulate(PLANT, CONTROLLER, scenario))
+    cut = replace(
+        log,
+        signals={**log.signals, "y": log.signals["y"][:3]},
+        columns={**log.columns, "y": log.columns["y"][:, :3]},
+    )
+    with pytest.raises(InputError, match="y2: found no such column of y, expected one of x1 y1 x2"):
+        judge_noise(CONTROLLER, cut)

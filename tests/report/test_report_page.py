@@ -7,6 +7,7 @@ import io
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -19,12 +20,13 @@ from page_checks import cells_of, read_page
 import malta
 from malta.bound import at_least
 from malta.cli.report import campaigns_of, read_subject
+from malta.loops.curves import loop_curves
 from malta.margins.verify import linear_report
 from malta.report.figures.drawing import STYLES, new_figure, printable
 from malta.report.page.analysis import Subject, analyse, key_figures
 from malta.report.page.document import Front, Page, dark_colour, pdf_of, render
 from malta.report.page.report import page_of
-from malta.report.page.sections import Illustration, PageTable, Section
+from malta.report.page.sections import Illustration, PageTable, Section, pole_difference
 from malta.report.verdict import SIGNS, verdict_lines
 
 if TYPE_CHECKING:
@@ -389,3 +391,24 @@ def test_a_page_says_which_loads_of_any_waveform_touch_nothing() -> None:
     assert "Left out: induced voltages, voltage limits and the DC link" in html
     assert "The largest share of a clearance that any waveform of a load uses" in html
     assert analyse(Subject(controller, controller.parameters), proof=False).loads == ()
+
+
+@pytest.mark.parametrize(
+    ("gains", "cause"),
+    [("halbach", "loads, with its currents held between readings."), ("robust", "loads."), (None, "")],
+)
+def test_a_page_says_why_poles_of_its_map_and_table_differ(gains: str | None, cause: str) -> None:
+    """Of `halbach` they are 0 and -2.5 rad/s, -1.3 +- 16.7j with held currents; loads move z of `robust` from 0 to 24."""
+    controller = malta.gains.read(f"design/gains/{gains}.json") if gains else cart_controller()
+    plant = malta.plant_of(controller.parameters)
+    loop = malta.loop(plant, controller)
+    found: Any = SimpleNamespace(
+        plant=plant,
+        report=SimpleNamespace(model=malta.linearize(plant, plant.at())),
+        curves=loop_curves(loop),
+    )
+    said = pole_difference(found)
+    assert bool(said) == bool(cause)
+    assert cause in said
+    poles, loaded = (np.linalg.eigvals(model.A) for model in (found.report.model, loop.model))
+    assert ("loads." in said) == (np.abs(np.sort_complex(poles) - np.sort_complex(loaded)).max() > 20)

@@ -18,6 +18,7 @@ from malta.arrays import FloatArray
 from malta.files import version
 from malta.loops.noise import budget_of
 from malta.merits import four_digits
+from malta.model.currents import is_commutated
 from malta.model.plant import Signal
 from malta.model.printed import published_figures
 from malta.report.figures.drawing import micro
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 
 CURVE_TOLERANCE = 1e-3  # relative difference of curves that a plot does not show
+SAME_POLE = 0.02  # of the fastest pole: difference that a map does not show
 
 
 class Panels(NamedTuple):
@@ -294,11 +296,24 @@ def _poles(a: Analysis) -> Iterator[Item]:
     yield Illustration(
         lambda: plots.pzmap(loops),
         "Poles of the closed loop and of the machine, and zeros of the loop gain; of sampled systems ln(z) / Ts. "
-        "The right side is the neighbourhood of the origin.",
+        "The right side is the neighbourhood of the origin." + pole_difference(a),
     )
     changed = a.subject.parameters != a.subject.controller.parameters
     published = None if changed else published_figures(a.plant.name)
     yield from sheets_of([poles_table(a.report.model, published), loop_poles_table(a.report)])
+
+
+def pole_difference(a: Analysis) -> str:
+    """Why poles of the machine in the map are not those of the table; "" where they are."""
+    table, drawn = np.linalg.eigvals(a.report.model.A), a.curves.poles["plant"]
+    apart = np.abs(table[:, None] - drawn[np.isfinite(drawn)][None]).min(axis=1, initial=np.inf)
+    if np.all(apart <= SAME_POLE * np.abs(table).max(initial=0.0)):
+        return ""
+    held = ", with its currents held between readings" if is_commutated(a.plant) else ""
+    return (
+        f" The machine in the map is the one in the loop: under its loads{held}. "
+        f"The table of open-loop poles is of the linear model without {'these' if held else 'them'}."
+    )
 
 
 def _margins(a: Analysis) -> Iterator[Item]:
