@@ -595,7 +595,7 @@ BAD: tuple[tuple[str, dict[str, Any], str], ...] = (
     ("ramp", {"speeds": (1e-3, 0.0)}, "ramp: speeds: found (0.001, 0.0), expected above 0"),
     ("ramp", {"distance": 0.2}, "ramp: distance: found 0.2 m, expected at most 0.1 m"),
     ("identify", {"F_z": 1e9}, "identify: F_z: found 1e+09 N, expected above 0 and at most 10000 N"),
-    ("budget", {"place": math.nan}, "budget: place: found nan, expected finite"),
+    ("budget", {"place": math.nan}, "budget: place: found nan, expected a finite number"),
     ("stroke", {}, "scenario: found 'stroke', expected one of step, ramp, stairs, force, budget, identify"),
 )
 

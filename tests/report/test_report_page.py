@@ -398,7 +398,7 @@ def test_a_page_says_which_loads_of_any_waveform_touch_nothing() -> None:
     [("halbach", "loads, with its currents held between readings."), ("robust", "loads."), (None, "")],
 )
 def test_a_page_says_why_poles_of_its_map_and_table_differ(gains: str | None, cause: str) -> None:
-    """Of `halbach` they are 0 and -2.5 rad/s, -1.3 +- 16.7j with held currents; loads move z of `robust` from 0 to 24."""
+    """Of `halbach` they are 0 and -2.5 rad/s, -1.3 +- 16.7j with held currents; loads move z of `robust` to 24."""
     controller = malta.gains.read(f"design/gains/{gains}.json") if gains else cart_controller()
     plant = malta.plant_of(controller.parameters)
     loop = malta.loop(plant, controller)

@@ -194,8 +194,8 @@ def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table
      scenario      what is run                                   options of its own
      ──────────────────────────────────────────────────────────────────────────────
      disturbance   A constant load of `size` (SI; 0: 1, or       on=all
-                   what half of the way to a contact takes) on   size=0.0
-                   one disturbance, or on each.                  time=0.0
+                   what half of the way to a contact takes) on   size=0.0 N
+                   one disturbance, or on each.                  time=0.0 s
     <BLANKLINE>
     """
     table = new_table(
