@@ -50,10 +50,10 @@ mutants: $(VENV)/dev
 	PYTHONPATH=tests $(BIN)/python -m mutants
 
 # With the kernels that OpenBLAS chooses itself, then with others: an old processor's, and where there is AVX-512 its own.
-# Half of the longer tests, drawn anew each time, to end within 90 minutes on a loaded computer: `make slow` runs all.
+# A third of the longer tests, drawn anew each time, to end within 90 minutes on a loaded computer: `make slow` runs all.
 check:
 	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES $(MAKE) lint types docs test
-	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.5 $(MAKE) slow
+	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.35 $(MAKE) slow
 	$(MAKE) processors RUNS="Prescott:fast Sandybridge:linear SkylakeX:linear"
 
 lint: $(VENV)/dev
