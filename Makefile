@@ -54,7 +54,7 @@ mutants: $(VENV)/dev
 check:
 	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES $(MAKE) lint types docs test
 	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES SHARE=0.35 $(MAKE) slow
-	$(MAKE) processors RUNS="Prescott:fast Sandybridge:linear SkylakeX:linear"
+	SHARE=0.35 $(MAKE) processors RUNS="Prescott:fast Sandybridge:linear SkylakeX:linear"
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .
