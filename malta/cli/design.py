@@ -338,8 +338,7 @@ def tune(
         _print_tables(tuned, files)
     if work.pressed:
         raise interruption(f"{target} is the best design by then; with --overwrite {goes_on}")
-    _name_open_entries(spec, tuned.requirements, target)
-    _require_all(tuned.requirements, target)
+    _require_all(spec, tuned.requirements, target)
 
 
 def _tune_structure(spec: Spec, target: Path, time: float | None, *, as_json: bool) -> None:
@@ -368,8 +367,7 @@ def _tune_structure(spec: Spec, target: Path, time: float | None, *, as_json: bo
         print_written(console, [target])
     if work.pressed:
         raise interruption(f"{target} is the best design by then")
-    _name_open_entries(spec, requirements, target)
-    _require_all(requirements, target)
+    _require_all(spec, requirements, target)
 
 
 def _judge(spec: Spec, file: Path, time: float | None, *, as_json: bool) -> None:
@@ -388,8 +386,7 @@ def _judge(spec: Spec, file: Path, time: float | None, *, as_json: bool) -> None
     else:
         make_console().print(report.requirements_table(requirements))
     require_whole(work)
-    _name_open_entries(spec, requirements, file)
-    _require_all(requirements, file)
+    _require_all(spec, requirements, file)
 
 
 def _write(spec: Spec, tuned: TuningResult, target: Path) -> list[Path]:
@@ -420,18 +417,13 @@ def _print_tables(tuned: TuningResult, files: Sequence[Path]) -> None:
     print_written(console, files)
 
 
-def _name_open_entries(spec: Spec, requirements: Sequence[Outcome], file: Path) -> None:
-    """Print which entries of the specification there was no time to judge."""
+def _require_all(spec: Spec, requirements: Sequence[Outcome], file: Path) -> None:
+    """Print what there was no time to judge; raise CheckError for what is not reached, and which of it binds most."""
     from malta.tuning.outcomes import open_entries
 
     left = open_entries(spec.specification, requirements)
     if left:
-        text = f"no time was left to judge {' '.join(left)}; malta tune {file} --check does"
-        print_note(f"{file}: {text}")
-
-
-def _require_all(requirements: Sequence[Outcome], file: Path) -> None:
-    """Raise CheckError when a requirement is not reached: which, by how much, and which binds most."""
+        print_note(f"{file}: no time was left to judge {' '.join(left)}; malta tune {file} --check does")
     failed = sorted((r for r in requirements if not r.holds), key=lambda r: -r.ratio)
     if failed:
         text = "; ".join(map(str, failed))

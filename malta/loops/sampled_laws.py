@@ -9,7 +9,6 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError
-from malta.linear.sampling import whole_or_not
 from malta.linear.uncertain import Compensator
 from malta.loops.sampled_loops import pad
 from malta.loops.windings import (
@@ -23,7 +22,7 @@ from malta.loops.windings import (
     with_current_control,
     with_estimated_emf,
 )
-from malta.model.plant import OperatingPoint, Plant, whole_samples
+from malta.model.plant import OperatingPoint, Plant, total_delay, whole_samples
 from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
 from malta.synthesis.linear_law import LinearLaw, linear_law, with_forces_read, with_readings, with_slope
@@ -89,11 +88,6 @@ def with_held_currents(law: LinearLaw, held: FloatArray | None, handed: int) -> 
     if held is not None:
         law = law._replace(D_y=law.D_y + pad(held, law.D_y.shape[1]))
     return with_readings(law, handed) if handed else law
-
-
-def total_delay(plant: Plant, Ts: float) -> float:
-    """Samples from a motion to its force: a delay of all readings is one of all forces."""
-    return whole_or_not(plant.actuator.delay(Ts) + plant.sensors.dead_time / Ts)
 
 
 def _integrals_last(law: LinearLaw, count: int) -> LinearLaw | None:

@@ -29,7 +29,7 @@ from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.model.parameters import si, units_of
-from malta.model.plant import Plant
+from malta.model.plant import Plant, total_delay
 from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
 
@@ -54,8 +54,7 @@ def loops_between_places(
         return "current controllers on windings"
     if not variable.isidentifier() or keyword.iskeyword(variable) or variable in units_of(plant.parameters):
         return f"{variable!r} is no name for one more parameter"
-    late = plant.sensors.dead_time / controller.sample_time
-    delay, part = split_delay(plant.actuator.delay(controller.sample_time) + late)
+    delay, part = split_delay(total_delay(plant, controller.sample_time))
     if part:
         return f"a delay of {delay + part:g} samples, which are not whole"
     found = []

@@ -26,10 +26,10 @@ from malta.linear.expressions import MatrixProgram, program
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import Loop
 from malta.loops.parametric_plants import held_gain, in_symbols
-from malta.loops.sampled_laws import total_delay, with_held_currents
+from malta.loops.sampled_laws import with_held_currents
 from malta.loops.sampled_loops import commanded_model, feedforward_slope
 from malta.model.currents import is_commutated
-from malta.model.plant import Plant
+from malta.model.plant import Plant, total_delay
 from malta.model.plants import plant_of
 from malta.proof.impulse_bounds import EPS, UP, Enclosed
 from malta.proof.polynomial.enclosure import Unproven

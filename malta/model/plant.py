@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import InputError
+from malta.linear.sampling import whole_or_not
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
 from malta.model.drive import Drive
@@ -435,6 +436,11 @@ def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:
     for f in fields(parameters):
         object.__setattr__(record, f.name, symbols.get(f.name, getattr(parameters, f.name)))
     return record
+
+
+def total_delay(plant: Plant, Ts: float) -> float:
+    """Samples from a motion to its force: a delay of all readings is one of all forces."""
+    return whole_or_not(plant.actuator.delay(Ts) + plant.sensors.dead_time / Ts)
 
 
 def given_plant(caller: str, given: Any) -> Plant:

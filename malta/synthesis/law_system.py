@@ -11,9 +11,9 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import balanced_units
-from malta.linear.sampling import whole_or_not
 from malta.model.machines import build_plant
 from malta.model.places import outputs_at
+from malta.model.plant import total_delay
 from malta.synthesis.controller import Controller
 from malta.synthesis.linear_law import linear_law
 
@@ -54,8 +54,7 @@ def compensator_fields(c: Controller) -> dict[str, Any]:
     lag = float(actuator.crossover) if math.isfinite(actuator.crossover) else None
     sums = 0 if c.observed else len(c.summed)
     Ts = c.sample_time
-    delay = whole_or_not(actuator.delay(Ts) + plant.sensors.dead_time / Ts)  # of readings: as one of forces
-    held = {"sample_time": Ts, "delay": delay, "lag": lag}
+    held = {"sample_time": Ts, "delay": total_delay(plant, Ts), "lag": lag}
     return {"A": law.A, "B": law.B_y, "C": law.C, "D": law.D_y, "integrals": sums, **held}
 
 

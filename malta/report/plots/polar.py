@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from malta.loops.linear_loops import Place
     from malta.synthesis.curve_limits import CurveLimit
 
+Window = tuple[float, float, float]  # left and right end, and half of the height
+
 MAX_LEFT_REACH = 4.0  # how far left of the origin a Nyquist plot reaches at most
 M_CIRCLES = (12.0, 6.0, 3.0, 1.0, 0.0, -3.0, -6.0, -12.0)  # dB of |T|
 LEADER = {"arrowstyle": "-", "linewidth": 0.6, "color": FORBIDDEN, "shrinkA": 0, "shrinkB": 0}
@@ -95,6 +97,7 @@ def nyquist(
         window = _window([margins for *_, margins in found])
         _draw_circles(panel)
         lines = []
+        gains: list[ComplexArray] = []
         for loop, curves, k, margins in found:
             style = styles[loop]
             gain = _inside(curves.responses.alone(at)[:, k], window)
@@ -104,10 +107,10 @@ def nyquist(
             _draw_direction(panel, gain, style)
             _draw_margins(panel, margins, style, window)
             lines.append((margins_text(margins, turns=True), style["color"]))
+            gains.append(gain)
         for limit in limits if at == "sensors" else ():
             if limit.curve == "S":
-                curves_here = [curves.responses.alone(at)[:, k] for _, curves, k, _ in found]
-                _draw_exclusion(panel, limit, window, curves_here, fails=fails_peak(loops, name, limit))
+                _draw_exclusion(panel, limit, window, gains, fails=fails_peak(loops, name, limit))
         panel.set_xlim(window[0], window[1])
         panel.set_ylim(-window[2], window[2])
         panel.set_aspect("equal", adjustable="box")
@@ -157,9 +160,6 @@ def _free_place(
 
     free = [place for place in places if left < place.real - half.real and not covered(place)]
     return free[0] if free else min(places, key=covered)
-
-
-Window = tuple[float, float, float]  # left and right end, and half of the height
 
 
 def _window(found: list[ChannelMargins]) -> Window:

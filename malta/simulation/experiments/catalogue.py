@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import partial
 from numbers import Real
-from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -267,14 +266,8 @@ EXPERIMENT_FIELDS = {
     *("name", "reference", "start", "cold", "disturbance", "anticipated", "excitation"),
     *("faults", "correction", "changes"),
 }
-COMMON_UNITS = {
-    "distance": "m",
-    "rise": "s",
-    "settle": "s",
-    "time": "s",
-}  # of options that many experiments have
+COMMON_UNITS = {"distance": "m", "rise": "s", "settle": "s", "time": "s"}  # of options of many experiments
 SIZED = {"step", "disturbance", WORST_LOAD}  # experiments here with a `size`, in the unit of signals
-NONE_GIVEN: Mapping[str, str] = MappingProxyType({})
 OPTIONS = {f.name for f in fields(Scenario)} - EXPERIMENT_FIELDS | {"engine"}
 
 
@@ -390,16 +383,17 @@ def options_of(name: str, plant: Plant) -> dict[str, Any]:
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "progress"}
 
 
-def option_units(name: str, plant: Plant, options: Mapping[str, str] = NONE_GIVEN) -> dict[str, str]:
+def option_units(name: str, plant: Plant, options: Mapping[str, str] | None = None) -> dict[str, str]:
     """SI units of an experiment's options by name; of a `size`, that of all signals that `options` choose, or none."""
     units: dict[str, str] = COMMON_UNITS | setting(plant, "OPTION_UNITS", {})
     if name not in SIZED or experiments_of(plant).get(name) is not EXPERIMENTS[name]:
         return units
+    given = options or {}
     if name == "step":
-        signals, which = [plant.outputs[k] for k in holdable_outputs(plant)], options.get("output", "all")
+        signals, which = [plant.outputs[k] for k in holdable_outputs(plant)], given.get("output", "all")
     else:
         signals = list(plant.disturbances)
-        which = options.get("on") or (signals[0].name if name == WORST_LOAD else "all")
+        which = given.get("on") or (signals[0].name if name == WORST_LOAD else "all")
     chosen = {s.unit for s in signals if which in ("all", s.name)}
     return {"size": chosen.pop() if len(chosen) == 1 else ""} | units
 
@@ -451,8 +445,9 @@ def _expected_kind(value: Any, default: Any) -> str:
     if isinstance(default, bool):
         return "" if isinstance(value, bool) else "true or false"
     if isinstance(default, Real):
-        finite = _is_number(value) and math.isfinite(value)
-        return "" if finite else "a finite number" if _is_number(value) else "a number"
+        if not _is_number(value):
+            return "a number"
+        return "" if math.isfinite(value) else "a finite number"
     if isinstance(default, tuple):
         several = isinstance(value, tuple | list) and len(value) > 0
         return "" if several and all(map(_is_number, value)) else "numbers"
