@@ -151,8 +151,8 @@ def _free_place(
     corners = [complex(x, y) for x in ends[::-1] for y in (1.6 * half.imag - high, high - 1.6 * half.imag)]
     places = [complex(-1, low), complex(-1, -low), *corners]
     steps = np.linspace(0, 1, 20)[:, None]
-    lines = [np.ravel(c[:-1] + steps * np.diff(c)) for c in curves]
-    points = np.concatenate([*lines, *np.conj(lines)])
+    upper = np.concatenate([np.ravel(c[:-1] + steps * np.diff(c)) for c in curves])
+    points = np.concatenate([upper, upper.conj()])
 
     def covered(place: complex) -> int:
         away = points - place
