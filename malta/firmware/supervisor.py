@@ -278,6 +278,7 @@ MONITORS = (
 
 ROUNDING = 1e-9  # share of what a sum of products consists of, below which it is zero
 MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
+SAMPLES_ACROSS = 5  # in which a reference goes half of its way, at most: one that jumps stops nowhere
 TOUCH = 0.7  # share of a clearance: two outputs at it are not beyond the clearance of a round bearing
 JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a returning reading may have
 # A reading that repeats so often while the reference of a lift or a landing goes so many of its standard deviations is
@@ -658,7 +659,8 @@ def reference_limits(t: Target) -> ReferenceLimits:
     """The limits of references: of the design file, or by default those of the machine.
 
     Positions: RESERVED_SHARE less than the way to a touchdown or the travel; else the range of its readings.
-    Accelerations: all that the forces can do. Speeds: from rest through twice the way with that, v = sqrt(4 a d). Of a
+    Accelerations: all that the forces can do, and at most what a sampled reference shows, which takes SAMPLES_ACROSS
+    samples for half of its way. Speeds: from rest through twice the way with that, v = sqrt(4 a d). Of a
     machine whose states are not positions and rates: see reachable_rates.
 
     Raises InputError for a position beyond the way to a touchdown, the travel, or what can be read.
@@ -666,7 +668,8 @@ def reference_limits(t: Target) -> ReferenceLimits:
     touch, most = touch_bounds(t.believed), accelerations(t.controller)
     position = np.where(np.isfinite(touch), (1 - RESERVED_SHARE) * touch, reading_ranges(t.believed))
     fastest, steepest = reachable_rates(t.controller, position)
-    acceleration = np.minimum(np.where(np.isfinite(most), most, steepest), MOST_RATE)
+    sampled = position / (SAMPLES_ACROSS * t.controller.sample_time) ** 2
+    acceleration = np.minimum(np.where(np.isfinite(most), most, steepest), np.minimum(sampled, MOST_RATE))
     speed = np.minimum(np.minimum(np.sqrt(4 * acceleration * position), fastest), MOST_RATE)
     limits = ReferenceLimits(*(_written_limits(values) for values in (position, speed, acceleration)))
     if not t.controller.references.size:

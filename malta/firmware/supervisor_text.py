@@ -292,10 +292,25 @@ def _bounds(t: Target) -> dict[str, Any]:
         "unbelieved": b.unbelieved,
         "uncommanded": _number(b.deviation, t),
         "leaps": bool(gains_without(t).L),
-        "loose": not t.believed.has_stroke and np.isinf(b.touch).any() and np.isfinite(b.touch).any(),
-        "endless": _number(1e17, t),
+        "landed_by": _landed_by(t),
     }
     return {name: _vector(getattr(b, name), t) for name in names} | stuck | counts
+
+
+def _landed_by(t: Target) -> str:
+    """Which of the outputs, by k, tell where they rest that a machine has landed, as a condition; "": all do.
+
+    Where nothing is met a reading is everywhere near. Where no output meets anything those tell that rest elsewhere
+    than they hover. A stroke rests anywhere.
+    """
+    stroke = t.believed.stroke_output if t.believed.has_stroke else -1
+    met = np.isfinite(np.delete(bounds_of(t).touch, stroke) if stroke >= 0 else bounds_of(t).touch)
+    conditions = [f"k != {stroke}"] if stroke >= 0 else []
+    if stroke < 0 and met.any() and not met.all():
+        conditions.append(f"near_touch[k] < {_number(1e17, t)}")
+    if not met.any():
+        conditions.append(f"is_near(sup->rest[k], {_number(0.0, t)}, k) == 0")
+    return " && ".join(conditions if len(conditions) < 2 else [f"({one})" for one in conditions])
 
 
 def _filters(t: Target, name: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -174,6 +175,7 @@ LONGEST_WISH, SLOW_WISH = (
 MAX_TRIAL_SAMPLES = 600  # samples until a row acts, the middle of long times left out
 SLOWLY = 50  # samples, in which the filter's expectation leaves the readings
 SAME_SHARE = 1e-9  # share by which readings differ that tell the same of the states
+SHARES = np.geomspace(1e-3, 1e3, 121)  # of a sensor's range, by which a filter that is lost is off
 PIECE_SCALE = 2.0**-25  # of drawn whole numbers up to 2^15: 1e-3
 PIECE_TIME = 0.02  # s, of a rise, and m, of a pole
 STROKE_SAMPLES = 20.0  # of a rise
@@ -191,7 +193,7 @@ def out_of_reach(t: Target) -> list[OutOfReach]:
     """Where a row counts but no fault of the test makes it act.
 
     A landing of a stroke alone ends at the first sample without its sensor; a law that sums nothing up has no memory
-    that holds a force at its limit.
+    that holds a force at its limit; a filter may expect nothing that is beyond all ranges.
     """
     found = []
     if _only_stroke(t):
@@ -202,6 +204,10 @@ def out_of_reach(t: Target) -> list[OutOfReach]:
         rows = [row for row in monitors_of(t) if row.key in ("HELPLESS", "SATURATION")]
         cells = dict.fromkeys((row.key, state) for row in rows for state in row.states)
         found += [OutOfReach(*cell, reason) for cell in cells if cell not in {one[:2] for one in found}]
+    if not np.isfinite(_lost_expectations(t)).any():
+        reason = "whatever the filter expects can be read"
+        states = [state for row in monitors_of(t) if row.key == "ASTRAY" for state in row.states]
+        found += [OutOfReach("ASTRAY", state, reason) for state in states]
     return found
 
 
@@ -263,6 +269,7 @@ def _faults(t: Target) -> dict[str, str]:
         "rest": _place_of_rest(t, 3 * b.settled),
         "shift": 1.5 * JUMP * sigma,
         "astray": 3 * b.range,
+        "lost": np.nan_to_num(_lost_expectations(t)),
         "coil": currents,
         "sum": [1e6],
         "factor": [3.0],
@@ -299,9 +306,7 @@ def _expectation(t: Target) -> dict[str, str]:
     """How readings depend on the filter's states near zero, states by the readings, and samples of a slow shift."""
     if t.controller.tracks == "errors":
         return {}
-    xi = ca.SX.sym("xi", len(t.controller.states))
-    slope = ca.Function("slope", [xi], [ca.densify(ca.jacobian(expected_readings(t)(xi), xi))])
-    C = np.array(slope(0))
+    C = _slope_of_readings(t)
     matrices = {
         "shows": C,
         "told": np.linalg.pinv(C, SAME_SHARE),
@@ -311,6 +316,13 @@ def _expectation(t: Target) -> dict[str, str]:
     return numbers | {
         key: ", ".join(f"{{ {_numbers(row, t)} }}" for row in rows) for key, rows in matrices.items()
     }
+
+
+def _slope_of_readings(t: Target) -> FloatArray:
+    """p x n: what the filter expects of the readings, by its states, near zero."""
+    xi = ca.SX.sym("xi", len(t.controller.states))
+    slope = ca.Function("slope", [xi], [ca.densify(ca.jacobian(expected_readings(t)(xi), xi))])
+    return np.array(slope(0))
 
 
 def _states_by_one_reading(C: FloatArray, ranges: FloatArray) -> FloatArray:
@@ -325,6 +337,26 @@ def _states_by_one_reading(C: FloatArray, ranges: FloatArray) -> FloatArray:
     return np.column_stack(columns)
 
 
+@lru_cache(maxsize=16)
+def _lost_expectations(t: Target) -> FloatArray:
+    """p: by how much states of one reading alone are off, to first order, where a filter expects what no sensor reads.
+
+    Three times its range, or else the least of SHARES of it whose expectation, which need not be linear, is beyond
+    twice the range; NaN where none is.
+    """
+    reach = bounds_of(t).range
+    if t.controller.tracks == "errors":
+        return 3 * reach
+    expect, columns = expected_readings(t), _states_by_one_reading(_slope_of_readings(t), reach)
+    found = np.full(len(reach), math.nan)
+    for k, column in enumerate(columns.T):
+        for share in (3.0, *SHARES, *-SHARES):
+            if abs(float(expect(share * reach[k] * column)[k])) > 2 * reach[k]:
+                found[k] = share * reach[k]
+                break
+    return found
+
+
 def _sensors(row: Monitor, t: Target) -> int:
     """The position sensors that can make a row act, a bit for each."""
     b = bounds_of(t)
@@ -335,6 +367,7 @@ def _sensors(row: Monitor, t: Target) -> int:
         "INNOVATION": np.isfinite(b.sigma),
         "STROKE": np.arange(len(b.sigma)) == (t.believed.stroke_output if t.believed.has_stroke else -1),
         "STUCK": np.array(b.stuck) < ENDLESS_SAMPLES,
+        "ASTRAY": np.isfinite(_lost_expectations(t)),
     }
     mask = able.get(row.key, np.ones(len(b.range), dtype=bool))
     return sum(1 << k for k, yes in enumerate(mask) if yes)

@@ -26,7 +26,8 @@ def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
         sensors; of the others `terms`, the factors of each parameter beside matrices, as {"k": (A1, B1, C1)}; `limits`
         (above, below) of parameters; `sample_time` (s) of matrices that give x+ in place of x'
 
-    Returns an UncertainSystem.
+    Returns an UncertainSystem. Of a Plant its forces act as a law commands them, behind its lag; `malta.loop` has the
+    current loops with their windings, and the currents that are held over a sample while the machine moves.
 
     Raises InputError for unknown options, and for names, shapes and values that do not fit.
 

@@ -8,6 +8,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+import angle_lag
+import flux_magnet
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -18,6 +20,7 @@ from malta.firmware.export import folder_files
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.firmware.supervisor import reference_limits
+from malta.firmware.vectors import out_of_reach
 from malta.simulation.layout import fidelities
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -139,3 +142,25 @@ def test_a_law_of_errors_without_integrals_passes_its_own_test(tmp_path: Path) -
     assert c.tracks == "errors"
     assert not c.Ki.any()
     passes(Target(c, "double", "force"), tmp_path)
+
+
+def law_of_machine(par: Any, Ts: float, **scales: list[float]) -> malta.Controller:
+    plant = malta.plant_of(par)
+    return malta.lqg(malta.linearize(plant, plant.at()), malta.synthesis.weights(**scales), Ts=Ts)
+
+
+def test_a_magnet_of_which_no_reading_meets_a_contact_passes_its_own_test(tmp_path: Path) -> None:
+    """What a lost filter expects of a flux is no multiple of its states; and a landing without its temperature goes on,
+    though the other readings are where they rest all the time."""
+    scales = {"q": [1e7, 1e3, 1.0, 1e-2], "r": [0.1], "w": [0.1], "v": [4e-8, 1e-6, 1e-4]}
+    t = Target(law_of_machine(flux_magnet.Parameters(), 250e-6, **scales), "double", "force")
+    assert "ASTRAY" not in {one.key for one in out_of_reach(t)}
+    passes(t, tmp_path)
+
+
+def test_a_reading_that_is_bounded_passes_its_own_test(tmp_path: Path) -> None:
+    """Whatever the filter remembers, it expects an angle that can be read: no fault makes ASTRAY act."""
+    scales = {"q": [1.0], "r": [1.0], "w": [1e-2], "v": [1e-8]}
+    t = Target(law_of_machine(angle_lag.Parameters(), 1e-3, **scales), "double", "force")
+    assert ("ASTRAY", "OPERATE") in {one[:2] for one in out_of_reach(t)}
+    passes(t, tmp_path)

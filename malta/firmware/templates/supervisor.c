@@ -864,11 +864,7 @@ static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in
     }
 {% else %}
     } else if (is_near(in->y[k], sup->rest[k], k) == 1) {
-{% if loose %}
-      there = (near_touch[k] < {{ endless }}) ? 1 : there; /* where nothing is met, a reading is everywhere near */
-{% else %}
-      there{{ " = (k != %d) ? 1 : there"|format(stroke_output) if stroke_output >= 0 else " = 1" }};
-{% endif %}
+      there = {{ "(%s) ? 1 : there"|format(landed_by) if landed_by else "1" }};
     } else {
       away{{ " = (k != %d) ? 1 : away"|format(stroke_output) if stroke_output >= 0 else " = 1" }};
     }

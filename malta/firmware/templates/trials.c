@@ -263,6 +263,7 @@ static void let_expect(flight *f, const {{ name }}_real readings[{{ outputs }}],
 static void disturb_expectation(flight *f, int32_t monitor, int32_t k, int32_t n) {
   static const {{ name }}_real shift[{{ outputs }}] = { {{ over.shift }} };
   static const {{ name }}_real astray[{{ outputs }}] = { {{ over.astray }} };
+  static const {{ name }}_real lost[{{ outputs }}] = { {{ over.lost }} };
   {{ name }}_real expects[{{ outputs }}];
   {{ name }}_real more = {{ zero }};
   bool agrees = true;
@@ -279,7 +280,7 @@ static void disturb_expectation(flight *f, int32_t monitor, int32_t k, int32_t n
     more = {{ over.factor }} * shift[k];
     break;
   case {{ NAME }}_MONITOR_ASTRAY:
-    more = astray[k] - expects[k];
+    more = lost[k] - expects[k];
     break;
   case {{ NAME }}_MONITOR_TOUCH:
   case {{ NAME }}_MONITOR_FOLLOWING:
