@@ -29,6 +29,8 @@ from malta.identification.log import Log, log_of
 from malta.identification.log_files import OTHER_SUFFIXES, read_log, write_log
 from malta.identification.measure import measure, plan_measurement
 from malta.identification.noise import dc_log, noise_table, process_noise
+from malta.identification.signal_checks import machine_findings, require_signals
+from malta.identification.spectra import in_axes
 from malta.identification.strokes import stroke_of
 from malta.identification.windings import identify_windings
 from malta.loops.classical import disk_sizes
@@ -261,8 +263,11 @@ def commission(
         if entry is None or (wanted and (only or logs)):
             if progress is not None:
                 progress(step.name)
-            read = partial(read_log, **(reading or {}))
-            entry = _take_step(step, bench, folder, None if logs is None else Path(logs), read)
+            if logs is None:
+                entry = _record_step(step, bench, folder)
+            else:
+                others = {one.sha256: one.name for one in entries if one.sha256}
+                entry = _read_step(step, controller, Path(logs), partial(read_log, **(reading or {})), others)
         else:
             kept.append(step.name)
         entries.append(entry)
@@ -279,25 +284,49 @@ def steps_of(plant: Plant, box: Mapping[str, float]) -> tuple[Check, ...]:
     return general_steps(plant, box) if own is None else own(box)
 
 
-def _take_step(
-    step: Check, bench: Bench, folder: Path, logs: Path | None, read: Callable[[Path], Log]
-) -> JournalEntry:
-    """Record or read the log of a step, and judge it."""
+def _record_step(step: Check, bench: Bench, folder: Path) -> JournalEntry:
+    """Record the log of a step, and judge it."""
     try:
-        if logs is None:
-            path = write_log(step.record(bench), folder / f"{step.name}.npz")
-        else:
-            found = [logs / f"{step.name}{suffix}" for suffix in (".npz", ".csv", ".mat", *OTHER_SUFFIXES)]
-            path = next((file for file in found if file.exists()), found[0])
-            if not path.exists():
-                return JournalEntry(
-                    step.name, step.question, str(path), "", (), f"waits for {path}: {step.needs}"
-                )
-        log = read_log(path) if logs is None else read(path)
+        path = write_log(step.record(bench), folder / f"{step.name}.npz")
     except CheckError as error:
         return JournalEntry(step.name, step.question, "", "", (), str(error))
+    return _judge_step(step, bench.controller, path, read_log(path))
+
+
+def _read_step(
+    step: Check, controller: Controller, logs: Path, read: Callable[[Path], Log], others: Mapping[str, str]
+) -> JournalEntry:
+    """Judge a bench's log of a step. others : the steps before it, by the digests of their logs"""
+    found = [logs / f"{step.name}{suffix}" for suffix in (".npz", ".csv", ".mat", *OTHER_SUFFIXES)]
+    path = next((file for file in found if file.exists()), found[0])
+    if not path.exists():
+        return JournalEntry(step.name, step.question, str(path), "", (), f"waits for {path}: {step.needs}")
     try:
-        findings = tuple(step.judge(bench.controller, log))
+        log = read(path)
+    except CheckError as error:
+        return JournalEntry(step.name, step.question, "", "", (), str(error))
+    refusal = _mistake_of(controller, log, others)
+    if refusal:
+        return JournalEntry(step.name, step.question, str(path), log.sha256, (), f"{path}: {refusal}")
+    return _judge_step(step, controller, path, log)
+
+
+def _mistake_of(controller: Controller, log: Log, others: Mapping[str, str]) -> str:
+    """What is wrong with a bench's log whatever its step asks, named; "": nothing."""
+    plant = plant_of(controller.parameters)
+    if log.sha256 in others:
+        return f"it is the log of step {others[log.sha256]}"
+    beyond = machine_findings(in_axes(log, plant), plant)
+    try:
+        require_signals(controller, plant, log)
+    except InputError as error:
+        return str(error).removeprefix(f"{log.source}: ")
+    return beyond[0] if beyond else ""
+
+
+def _judge_step(step: Check, controller: Controller, path: Path, log: Log) -> JournalEntry:
+    try:
+        findings = tuple(step.judge(controller, log))
     except CheckError as error:
         return JournalEntry(step.name, step.question, str(path), log.sha256, (), str(error))
     return JournalEntry(step.name, step.question, str(path), log.sha256, findings)

@@ -231,7 +231,7 @@ def _impossible_readings(log: Log, plant: Plant) -> list[str]:
             ):
                 beyond = f"beyond the travel of {quantity(plant.stroke.travel, signal.unit)}"
             elif share > LIMIT_SLACK:
-                beyond = f"{share:.3g} times the clearance"
+                beyond = f"{share:.3g} times the clearance{' (in another unit?)' if share > 100 else ''}"
             if beyond:
                 found.append(f"{signal.name} reads {quantity(end, signal.unit)}, {beyond}")
     return found

@@ -28,6 +28,7 @@ from malta.identification.commission import (
     read_journal,
     steps_of,
 )
+from malta.identification.log import log_of
 from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.machines.tubular import bench as tubular
 from malta.model.equilibrium import trim
@@ -370,3 +371,27 @@ def test_a_log_at_rest_without_a_sensor_is_refused() -> None:
     )
     with pytest.raises(InputError, match="y2: found no such column of y, expected one of x1 y1 x2"):
         judge_noise(CONTROLLER, cut)
+
+
+def test_mistakes_in_a_benchs_logs_are_named(tmp_path: Path) -> None:
+    """Swapped columns, a sign, another unit, and the log of another step are refused whatever a step looks at."""
+    plan = malta.excite(malta.loop(PLANT, CONTROLLER), period=0.25, periods=3, band=(8, 400))
+    right = log_of(malta.simulate(PLANT, CONTROLLER, malta.Scenario.excited(plan.signal, plan.duration)))
+    y = right.columns["y"]
+    tables = {"right": y, "swapped": y[:, [1, 0, 2, 3, 4]], "turned": y * [1, 1, 1, 1, -1], "scaled": 1e6 * y}
+    for name, table in tables.items():
+        found = replace(right, columns={**right.columns, "y": table})
+        malta.identification.write_log(found, tmp_path / f"{name}.npz")
+    (tmp_path / "copied.npz").write_bytes((tmp_path / "right.npz").read_bytes())
+    said = {}
+    for name in (*tables, "copied"):
+        chosen = dict.fromkeys(("right", name))
+        steps = [Check(step, "Is it so?", "", "", lambda _: right, lambda *_: []) for step in chosen]
+        done = commission(ROBUST, CONTROLLER, tmp_path / name, steps=steps, logs=tmp_path)
+        said[name] = done.entries[-1].refusal
+    assert said.pop("right") == ""
+    for name, words in (
+        ("swapped", "are x1 and y1 swapped?"), ("turned", "z: found the other sign"), ("scaled", "a million times"),
+        ("copied", "it is the log of step right"),
+    ):  # fmt: skip
+        assert words in said[name]
