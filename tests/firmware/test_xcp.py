@@ -306,6 +306,14 @@ def test_a_busy_port_is_one_sentence(program: Path) -> None:
     assert (gone.returncode, gone.stderr.count("\n")) == (2, 1)
 
 
+@pytest.mark.parametrize("port", ["70000", "0", "-1", "5555x", ""])
+def test_a_port_that_is_none_is_one_sentence(program: Path, port: str) -> None:
+    done = subprocess.run(
+        [program, "udp", "127.0.0.1", port], capture_output=True, text=True, check=False, timeout=10
+    )
+    assert (done.returncode, done.stderr) == (2, f"UDP port: found {port}, expected 1 to 65535\n")
+
+
 def test_the_a2l_has_the_slave_and_its_addresses() -> None:
     text = a2l_text(slave(6000), "halbach")
     assert '0x0100 6000 ADDRESS "127.0.0.1"' in text

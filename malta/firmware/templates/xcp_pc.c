@@ -34,6 +34,17 @@ static void on_timer(void) {
   {{ name }}_xcp_event(&xcp);
 }
 
+/* A port as a text says it, or the end. */
+static int32_t port_of(const char *text) {
+  char *end;
+  const long port = strtol(text, &end, 10);
+  if ((*end != '\0') || (port < 1) || (port > 65535)) {
+    fprintf(stderr, "UDP port: found %s, expected 1 to 65535\n", text);
+    exit(2);
+  }
+  return (int32_t)port;
+}
+
 static int32_t open_udp(const char *address, int32_t port) {
   struct sockaddr_in own;
   const int32_t s = socket(AF_INET, SOCK_DGRAM, 0);
@@ -125,7 +136,7 @@ int main(int argc, char **argv) {
   if (serial) {
     s = open_serial(argv[2]);
   } else if (argc == 4) {
-    s = open_udp(argv[2], atoi(argv[3]));
+    s = open_udp(argv[2], port_of(argv[3]));
   } else {
     s = open_udp({{ NAME }}_XCP_ADDRESS, {{ NAME }}_XCP_PORT);
   }
