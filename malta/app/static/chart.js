@@ -139,7 +139,7 @@ export function createChart(label) {
       const [[left, to], [low, high]] = [ends(shape.x, x), ends(shape.y, y)];
       if (left < to && low < high) {
         const words = shape.text ? `${shape.text}${shape.fails ? " FAILS" : ""}` : "";
-        const place = shape.row === undefined ? { x: right - 4, y: toY(low) - 4, "text-anchor": "end" } : { ...(toX(left) + LETTER * words.length > right ? { x: right - 4, "text-anchor": "end" } : { x: toX(left) + 4 }), y: Math.max(shown.top + 12 + 11 * shape.row, toY(low) - toY(high) > 13 ? toY(high) + 11 : 0) };
+        const place = shape.row === undefined ? { x: right - 4, y: toY(low) - 4, "text-anchor": "end" } : { ...(toX(left) + LETTER * words.length > right ? { x: right - 4, "text-anchor": "end" } : { x: toX(left) + 4 }), y: Math.max(shown.top + 12 + 11 * shape.row, toY(low) - toY(high) > 18 ? toY(high) + 16 : 0) };
         group.append(svg("rect", { ...look(shape), x: toX(left), y: toY(high), width: toX(to) - toX(left), height: toY(low) - toY(high) }));
         group.append(svg("text", { class: `zone asked${shape.fails ? " fails" : ""}`, ...place }, words));
         s.named.push({ left: place.x - LETTER * words.length, y: place.y });

@@ -91,7 +91,8 @@ export function nyquistView(picture, pins, reach, hidden, pull, state) {
       ...(circles.length ? circles.map(({ limit, fails }) => ({ kind: "circle", x: -1, y: 0, r: 1 / limit.limit, class: "asked", fails })) : [{ kind: "circle", x: -1, y: 0, r: 1 / 3, class: "forbidden" }]),
       { kind: "line", x: 0 }, { kind: "line", y: 0 },
       { kind: "text", x: -1, y: 0, text: "+", drop: 3.5 },
-      ...(circles.length ? circles.map(({ limit, fails }) => ({ kind: "text", x: -1, y: -1 / limit.limit, text: `${limit.words} ≤ ${limit.text}${fails ? " FAILS" : ""}`, drop: 12, class: `zone asked${fails ? " fails" : ""}` })) : [{ kind: "text", x: -1, y: 1 / 3, text: "|S| > 3", drop: -4 }]),
+      // The names of circles stand in the corner, where no loop that crosses over near -1 passes.
+      ...(circles.length ? circles.map(({ limit, fails }, k) => ({ kind: "text", x: -1 + reach, y: -reach, shift: -4, drop: -5 - 12 * k, anchor: "end", text: `${limit.words} ≤ ${limit.text}${fails ? " FAILS" : ""}`, class: `zone asked${fails ? " fails" : ""}` })) : [{ kind: "text", x: -1, y: 1 / 3, text: "|S| > 3", drop: -4 }]),
     ],
     lines: [...pins.flatMap((pin) => curves(pin.picture.frequency, true)), ...curves(picture.frequency, false)],
     summary: `${sensors.length} ${sensors.length > 1 ? "curves" : "curve"} from ${digits(w[0], 3)} to ${digits(w[w.length - 1], 3)} rad/s`,

@@ -327,7 +327,8 @@ def draw_limit(
 
     along, across : the region, low and high, of x and y; what lies outside of the panel is cut off
     text : the requirement
-    line : of several regions, in which line below the panel's top their texts stand; None: at the region's edge
+    line : of several regions, in which line below the panel's top their texts end at its right; None: at the
+        region's edge
     """
     edges = [sorted(axes.get_xlim()), sorted(axes.get_ylim())]
     (left, right), (low, high) = (
@@ -343,12 +344,16 @@ def draw_limit(
     axes.plot([left, right], [level, level], **LIMIT_LINE)
     if right < edges[0][1]:
         axes.plot([right, right], [low, high], **LIMIT_LINE)
-    up = upward and line is None
-    axes.annotate(
-        plain(f"{text} {'FAILS' if fails else 'asked'}"), (left, level if line is None else edges[1][1]),
-        xytext=(3, 2 if up else -2 - 9 * (line or 0)), textcoords="offset points", va="bottom" if up else "top",
-        zorder=6, **limit_text(fails=fails),
-    )  # fmt: skip
+    look = limit_text(fails=fails) | ({"bbox": CLEAR_BOX} if fails or line is not None else {})
+    look |= {"textcoords": "offset points", "zorder": 6}
+    words = plain(f"{text} {'FAILS' if fails else 'asked'}")
+    if line is None:
+        move = (3, 2 if upward else -2)
+        axes.annotate(words, (left, level), xytext=move, va="bottom" if upward else "top", ha="left", **look)
+    else:  # at its end a response has decayed
+        axes.annotate(
+            words, (1, 1), xytext=(-3, -3 - 11 * line), xycoords="axes fraction", va="top", ha="right", **look
+        )
 
 
 def region_styles(*, fails: bool) -> list[dict[str, Any]]:
