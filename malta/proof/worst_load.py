@@ -41,7 +41,7 @@ from malta.linear.uncertain import Compensator, StateGroup, UncertainSystem
 from malta.proof.box import Box, within_branches
 from malta.proof.groups import loop_of
 from malta.proof.impulse_bounds import UP, Enclosed, enclose, l1_norms, push_in_parts, reach_of, sizes_of
-from malta.proof.polynomial.closed_loop import add_lag, closed_loop, dense, driven_group
+from malta.proof.polynomial.closed_loop import add_lag, closed_loop, dense, driven_group, hold
 from malta.proof.polynomial.enclosure import Unproven, precision
 from malta.work import count_work, is_past
 
@@ -91,7 +91,10 @@ class _Point(NamedTuple):
     spread: FloatArray  # by how much this may differ from its mean within a part: states x inputs
     size: FloatArray  # of the rates of the plant with its lags, entry by entry
     unit: FloatArray  # of these inputs, likewise
-    into: FloatArray  # of B; zero where lags are before it
+    into: FloatArray  # of what commands add to them
+    within: tuple[
+        tuple[Enclosed, Enclosed], ...
+    ]  # e^(A t) - 1 and the integral of e^(A t) B, at times in a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +207,13 @@ class _LoadedLoop:
                 [*((i, k, 1) for k, i in enumerate(units)), *((i, len(units), v) for i, _, v in b)],
             )  # fmt: skip
             columns, spread = push_in_parts(a, unit, self.T, parts)
-            point = M.part(kept, kept), sizes_of(a), sizes_of(unit), sizes_of(into)
+            point = (
+                M.part(kept, kept),
+                sizes_of(a),
+                sizes_of(unit),
+                sizes_of(into),
+                _within_sample(a, into, self.T),
+            )
         blank = np.zeros((len(M.mid) - x, len(units) + 1))
         whole = [Enclosed(*(np.vstack([part, blank])[kept] for part in one)) for one in columns]
         closed = Enclosed(point[0].mid + np.eye(len(kept)), point[0].rad)
@@ -225,6 +234,8 @@ class _LoadedLoop:
     def curvatures(self, sides: FloatArray) -> tuple[FloatArray, float]:
         """Bounds of |h_ii|_1 for each parameter over a cell, and of |h|_1 itself. Raises Unproven."""
         rows, (low, high) = self.changing, self.over(sides)
+        if not rows:  # of which the loop does not depend
+            return np.zeros(len(sides)), math.inf
         q, k, r = len(sides), len(rows), UP * np.nextafter((sides[:, 1] - sides[:, 0]) / 2, math.inf)
         low, high = low[:, rows], high[:, rows]
         V = (low[1::2] + high[1::2]) / 2  # slopes, parameters x rows x signals
@@ -252,31 +263,87 @@ class _LoadedLoop:
         """Norms at parameters p from the rates of changing states, and from the load.
 
         V : functions of the signals x and u. Rows: the output at samples; these functions, and the signals, at any time
+
+        At times within a sample x = e^(A t) x_k + the integral of e^(A t) B u_k + what has come in since, whose norm is
+        added up; between these times sizes stand in place of all numbers.
         """
-        point, kept, eps = self.at(p, self.changing, 1), self.kept, np.finfo(float).eps
-        x, m, size = len(point.size), len(self.inputs), self.inputs.shape[1]
-        n = x if self.law.lag is not None else x + m  # signals
-        signals = np.vstack([np.eye(x, size), self.inputs])[:n]
-        table = np.vstack([np.pad(self.output, (0, size - len(self.output))), V @ signals, signals])[:, kept]
-        sums = np.abs(self.law.D) @ np.abs(self.measured)
-        rad = (
-            np.abs(signals)
-            + np.vstack([np.zeros((x, size)), np.pad(sums, ((0, 0), (0, size - sums.shape[1])))])[:n]
+        point = self.at(p, self.changing, 1)
+        x, k, size = len(point.size), point.unit.shape[1], self.inputs.shape[1]
+        first, held = 1 + len(V), V.shape[1] > x  # whether commands are among the signals
+        own, U = np.eye(x, size), self._enclosed_inputs()
+        step = linalg.expm(
+            self.T / len(point.within) * system_matrix(point.size, np.hstack([point.unit, point.into]))
         )
-        rad = 4 * (size + m) * eps * np.vstack([0 * rad[:1], np.abs(V) @ rad, rad])[:, kept]
-        used, found = table.any(axis=1), np.zeros((len(table), point.unit.shape[1]))
-        rows = Enclosed(table[used], rad[used])
-        found[used] = l1_norms(point.M, rows, point.columns[0], point.spread, CENTRE_SHARE)[1]
-        # Between samples, x = e^(A t) x_k and what u and inputs add, with sizes in place of all numbers.
-        into = np.hstack([point.unit, point.into])
-        held = linalg.expm(self.T * system_matrix(point.size, into))[:x, x:]
-        first, k = 1 + len(V), point.unit.shape[1]
-        moved = (linalg.expm(self.T * point.size) - np.eye(x)) @ found[first : first + x] + held[:, :k]
-        if n > x:
-            moved += held[:, k:] @ found[first + x :]
-        found[first : first + x] += UP * moved
-        found[1:first] += UP * np.abs(V[:, :x]) @ moved
+        grown, into = step[:x, :x] - np.eye(x), step[:x, x:]
+        output = np.pad(self.output, (0, size - len(self.output)))[None]
+        rows = []
+        for moved, driven in point.within:
+            X = _add_enclosed(
+                _times(moved, Enclosed(own, 0 * own)), _times(driven, U), Enclosed(own, 0 * own)
+            )
+            signals = _stack_enclosed(X, U) if held else X
+            rows += [Enclosed(output, 0 * output), _times(Enclosed(V, 0 * V), signals), X, U]
+        every = self._row_norms(point, _stack_enclosed(*rows)).reshape(len(point.within), -1, k)
+        since, found = np.zeros((x, k)), np.zeros((first + V.shape[1], k))
+        for N in every:
+            at = N[first : first + x] + since
+            more = since + UP * (grown @ at + into[:, :k] + into[:, k:] @ N[first + x :])
+            N[1:first] += UP * np.abs(V[:, :x]) @ more
+            N[first : first + x] += more
+            found = np.maximum(found, N[: len(found)])
+            if len(every) > 1:
+                E = point.within[1][0]
+                since = UP * ((np.abs(E.mid + np.eye(x)) + E.rad) @ since + into[:, :k])
         return found
+
+    def _enclosed_inputs(self) -> Enclosed:
+        """`inputs`, whose sums of products were rounded."""
+        size, m = self.inputs.shape[1], len(self.inputs)
+        sums = np.abs(self.law.D) @ np.abs(self.measured)
+        rad = np.abs(self.inputs) + np.pad(sums, ((0, 0), (0, size - sums.shape[1])))
+        return Enclosed(self.inputs, 4 * (size + m) * np.finfo(float).eps * rad)
+
+    def _row_norms(self, point: _Point, rows: Enclosed) -> FloatArray:
+        """Upper bounds of the norms of rows of all states from the load and its like; 0 of rows that are zero."""
+        kept = Enclosed(rows.mid[:, self.kept], rows.rad[:, self.kept])
+        used = (kept.mid != 0).any(axis=1) | (kept.rad != 0).any(axis=1)
+        found = np.zeros((len(used), point.unit.shape[1]))
+        if used.any():
+            some = Enclosed(kept.mid[used], kept.rad[used])
+            found[used] = l1_norms(point.M, some, point.columns[0], point.spread, CENTRE_SHARE)[1]
+        return found
+
+
+MAX_GROWTH, MAX_TIMES = (
+    0.5,
+    64,
+)  # of e^(|A| t) between times within a sample, as an exponent; and their number
+
+
+def _within_sample(a: Any, into: Any, T: float) -> tuple[tuple[Enclosed, Enclosed], ...]:
+    """e^(a t) - 1 and the integral of e^(a t) b at times within a sample, more of them the faster its states are."""
+    fastest = float(np.abs(np.linalg.eigvals(sizes_of(a))).max(initial=0.0))
+    count = min(max(math.ceil(fastest * T / MAX_GROWTH), 1), MAX_TIMES)
+    pairs = [hold(arb_mat, a, into, arb(T) * k / count) for k in range(count)]
+    return tuple((enclose(phi), enclose(gamma)) for phi, gamma in pairs)
+
+
+def _times(one: Enclosed, two: Enclosed) -> Enclosed:
+    """The product of enclosed matrices, rounding included."""
+    sizes = np.abs(one.mid) @ np.abs(two.mid)
+    rad = one.rad @ (np.abs(two.mid) + two.rad) + np.abs(one.mid) @ two.rad
+    return Enclosed(one.mid @ two.mid, UP * (rad + 4 * (one.mid.shape[1] + 2) * np.finfo(float).eps * sizes))
+
+
+def _add_enclosed(*parts: Enclosed) -> Enclosed:
+    """The sum of enclosed matrices, rounding included."""
+    mids, rads = np.array([one.mid for one in parts]), np.array([one.rad for one in parts])
+    rad = rads.sum(axis=0) + 4 * len(parts) * np.finfo(float).eps * np.abs(mids).sum(axis=0)
+    return Enclosed(mids.sum(axis=0), UP * rad)
+
+
+def _stack_enclosed(*parts: Enclosed) -> Enclosed:
+    return Enclosed(np.vstack([one.mid for one in parts]), np.vstack([one.rad for one in parts]))
 
 
 class _LoadCell(NamedTuple):

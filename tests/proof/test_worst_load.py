@@ -14,7 +14,7 @@ from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.box import box_of
 from malta.proof.impulse_bounds import Enclosed, l1_norms
 from malta.proof.polynomial.enclosure import Unproven
-from malta.proof.worst_load import prove_load
+from malta.proof.worst_load import _LoadedLoop, prove_load
 
 
 def plain(M: np.ndarray) -> Enclosed:
@@ -50,23 +50,23 @@ def test_a_loop_that_may_be_unstable_has_no_norm() -> None:
             l1_norms(M, plain(one), plain(one), 0 * one, 1e-3)
 
 
-def mass(k: float) -> tuple[UncertainSystem, Compensator, ca.Function]:
-    """m x'' = c x + u + w, x measured, with a PD law whose delay is k samples."""
+def mass(k: float, lag: float | None = None) -> tuple[UncertainSystem, Compensator, ca.Function]:
+    """m x'' = c x + u + w, x measured, with a PD law whose delay is k samples, and a lag of its force."""
     p = ca.SX.sym("p", 2)
     A, B = ca.SX(2, 2), ca.SX(2, 1)
     A[0, 1], A[1, 0], B[1, 0] = 1, p[1] / p[0], 1 / p[0]
     matrices = ca.Function("matrices", [p], [A, B, ca.DM([[1.0, 0.0]])])
     system = UncertainSystem(("m", "c"), np.array([1.0, 50.0]), matrices)
     T, one = 1e-3, np.ones((1, 1))
-    law = Compensator(0 * one, one, 20 / T * one, -(200 + 20 / T) * one, 0, T, delay=k)
+    law = Compensator(0 * one, one, 20 / T * one, -(200 + 20 / T) * one, 0, T, delay=k, lag=lag)
     return system, law, ca.Function("load", [p], [ca.vertcat(0, 1 / p[0])])
 
 
-def brute_norm(system: UncertainSystem, law: Compensator, p: np.ndarray) -> float:
-    """By a load that is constant in twentieths of a sample: below the norm, by little."""
+def impulse(system: UncertainSystem, law: Compensator, p: np.ndarray) -> np.ndarray:
+    """What a load in each twentieth of a sample before makes of x at samples: its sizes add up to the norm, nearly."""
     T, parts = law.sample_time or 0.0, 20
     A = system.at(p[None])[0][0]
-    M = np.eye(3 + int(law.delay)) + T * closed_loop(system, law, p[None])[0]
+    M = np.eye(3 + int(law.delay) + (law.lag is not None)) + T * closed_loop(system, law, p[None])[0]
     b, left = np.array([0, 1 / p[0], 0]), []
     for k in range(parts + 1):
         whole = np.zeros((3, 3))
@@ -74,15 +74,21 @@ def brute_norm(system: UncertainSystem, law: Compensator, p: np.ndarray) -> floa
         left.append(linalg.expm(whole * T * (1 - k / parts))[:2, 2])
     X = np.zeros((len(M), parts))
     X[:2] = -np.diff(np.array(left), axis=0).T
-    total = 0.0
+    rows = []
     for _ in range(3000):
-        total, X = total + float(np.abs(X[0]).sum()), M @ X
-    return total
+        rows.append(X[0])
+        X = M @ X
+    return np.array(rows)
 
 
-@pytest.mark.parametrize("delay", [0, 1])
-def test_no_machine_of_the_box_moves_further_than_is_proven(delay: int) -> None:
-    system, law, load = mass(delay)
+def brute_norm(system: UncertainSystem, law: Compensator, p: np.ndarray) -> float:
+    """By a load that is constant in twentieths of a sample: below the norm, by little."""
+    return float(np.abs(impulse(system, law, p)).sum())
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(0, None), (1, None), (0, 1500.0), (0, 20e3)])
+def test_no_machine_of_the_box_moves_further_than_is_proven(delay: int, lag: float | None) -> None:
+    system, law, load = mass(delay, lag)
     box = box_of(system.names, system.nominal, (), {"m": 0.2, "c": (20.0, 90.0)}, {})
     found = prove_load(system, law, load, np.array([1.0, 0.0]), box)
     assert found.upper is not None
@@ -117,6 +123,35 @@ def test_nothing_is_proven_of_a_box_that_holds_an_unstable_loop() -> None:
     found = prove_load(system, law, load, np.array([1.0, 0.0]), box, work=2)
     assert found.upper is None
     assert found.reason == "the loop is unstable"
+
+
+def test_a_parameter_of_which_the_loop_does_not_depend_changes_nothing() -> None:
+    system, law, load = mass(0)
+    free = UncertainSystem(
+        ("m", "c"),
+        system.nominal,
+        ca.Function("none", [p := ca.SX.sym("p", 2)], system.matrices(system.nominal)),
+    )
+    still = ca.Function("load", [p], [load(system.nominal)])
+    found = prove_load(
+        free, law, still, np.array([1.0, 0.0]), box_of(free.names, free.nominal, (), {"m": 0.2}, {})
+    )
+    assert found.upper is not None
+    assert found.upper == pytest.approx(found.lower, rel=2e-3)  # parts of a sample
+    assert found.upper >= brute_norm(system, law, system.nominal)
+
+
+@pytest.mark.parametrize("lag", [300.0, 1500.0])
+def test_slopes_of_a_loop_with_a_lag_are_bounded(lag: float) -> None:
+    """The second derivative of the impulse response by m, by differences, at a cell of no width."""
+    system, law, load = mass(0, lag)
+    sides = np.array([[1.0, 1.0], [50.0, 50.0]])
+    loop = _LoadedLoop(system, law, load, np.array([1.0, 0.0]), np.array([[0.99, 1.01], [50.0, 50.0]]))
+    bent, whole = loop.curvatures(sides)
+    h, step = [impulse(system, law, np.array([m, 50.0])) for m in (0.999, 1.0, 1.001)], 1e-3
+    assert np.abs(h[1]).sum() <= whole
+    true = np.abs(h[2] - 2 * h[1] + h[0]).sum() / step**2
+    assert true <= bent[0] <= 100 * true  # a product of three norms
 
 
 def test_outputs_that_move_with_the_parameters_are_named() -> None:
