@@ -29,7 +29,8 @@ from malta.files import PICTURES
 from malta.work import is_stopped
 
 if TYPE_CHECKING:
-    pass
+    from malta.identification.realization import Realization
+    from malta.synthesis.controller import Controller
 
 
 @add_log_options
@@ -80,6 +81,12 @@ def identify(
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw responses, what is left, and S: .png or .svg.")
     ] = None,
+    order: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N", help="No parameters: a linear model with so many states, or auto, by the logs alone."
+        ),
+    ] = None,
     record: Annotated[
         str | None,
         typer.Option(metavar="SPAN", help="Of any record, without an excitation: its seconds 2..10, or all."),
@@ -94,9 +101,11 @@ def identify(
     What is known only so well widens the total intervals; imperfections of a bench may explain what parameters do not.
     A log that neither explains, or whose S is another one, is refused with exit code 1, and no file is written.
     Of one log masses are known; with --loaded and --added they come out.
+    With --order a linear model is realized without the machine's equations; -o model.csv writes its responses.
 
     \b
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
+              malta identify design/gains/robust.json log.npz --order auto --validate second.npz
     """
     from malta.identification.data_file import write_data
     from malta.identification.identify import GROUPS, identify as identify_parameters, weigh
@@ -116,13 +125,21 @@ def identify(
         quality_table,
     )
 
-    require_suffixes((out, (".toml",)), (figure, PICTURES))
+    require_suffixes((out, (".toml",) if order is None else (".csv",)), (figure, PICTURES))
     alone = {"--record": record, "--loaded": loaded, "--robust": robust, "--drive": drive}
     for option, value in alone.items() if len(logs) > 1 else ():
         if value:
             raise InputError(option, "", f"{len(logs)} logs", "one log")
     log = ", ".join(map(str, logs))
     controller = read_controller(gains, machine)
+    if order is not None:
+        given = {"-p": parameters, "--known": known, "--added": added, "--figure": figure, **alone}
+        for option in [option for option, value in given.items() if value][:1]:
+            raise InputError("--order", "", f"{option} beside it", "one of them")
+        with work_until(f"realizing from {log}", time):
+            models = _realize(controller, order, logs, fresh, reading)
+        _print_models(gains, models, out, as_json=as_json)
+        return
     believed = plant_of(controller.parameters)
     values = read_known(known, units_of_model(believed) | bench_units(believed))
     more = read_assignments("--added", added, units_of_model(believed))
@@ -202,6 +219,48 @@ def identify(
     refusal = refusal or (windings.refusal if windings is not None else "")
     if refusal:
         raise CheckError(f"{log}: {refusal}")
+
+
+def _realize(
+    controller: Controller, order: str, logs: list[Path], fresh: Path | None, reading: Reading
+) -> list[Realization]:
+    """A linear model of logs alone, and the same with its figures on a fresh log. Raises InputError for its order."""
+    from malta.identification.log import in_order
+    from malta.identification.log_files import read_log
+    from malta.identification.realization import realize
+    from malta.model.plants import plant_of
+
+    if not (order == "auto" or order.isdecimal()):
+        raise InputError("--order", "", repr(order), "a number of states, or auto")
+    plant, groups = plant_of(controller.parameters), ("y", "v", "excitation")
+    read = [in_order(read_log(one, groups, **reading), plant) for one in (*logs, *([fresh] if fresh else []))]
+    found = realize(read[: len(logs)], None if order == "auto" else int(order))
+    return [found, *(found.validate(log) for log in read[len(logs) :])]
+
+
+def _print_models(gains: Path, found: list[Realization], out: Path | None, *, as_json: bool) -> None:
+    """Print a model of logs alone, and write its responses. Raises CheckError where the fresh log refuses it."""
+    from malta.cli.documents.others import RealizeOutput
+    from malta.identification.frequency_response import write_responses
+
+    model, *others = found
+    refusal = "".join(other.refusal for other in others)
+    files = [] if out is None or refusal else [write_responses(model.responses(), out)]
+    if as_json:
+        fits = [other.fit for other in others]
+        print_document(
+            RealizeOutput.of(
+                model, gains=gains, fresh_fit=fits[0] if fits else None, refusal=refusal, files=files
+            )
+        )
+    else:
+        console = make_console()
+        print_text(console, f"{model.source}: {model.sentence}")
+        for one in found:
+            print_text(console, f"{one.source}: fit at the lines: {one.fit_words}")
+        print_written(console, files)
+    if refusal:
+        raise CheckError(refusal)
 
 
 def read_span(option: str, text: str) -> tuple[float, float]:
