@@ -64,16 +64,14 @@ def identify(
     ] = False,
     loaded: Annotated[
         Path | None,
-        typer.Option(
-            metavar="LOG", help="A second log, with a known mass on the machine: the mass comes out."
-        ),
+        typer.Option(metavar="LOG", help="A second log, with a known mass on it: that comes out."),
     ] = None,
     added: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="What it adds to a parameter, as m=100g. Repeatable."),
     ] = None,
     drive: Annotated[
-        bool, typer.Option("--drive", help="R, L and dead time of the drive too, from voltages in the log.")
+        bool, typer.Option("--drive", help="R, L and dead time of the drive, from voltages.")
     ] = False,
     fresh: Annotated[
         Path | None, typer.Option("--validate", metavar="LOG", help="A second log, to be predicted.")
@@ -82,14 +80,10 @@ def identify(
         Path | None, typer.Option(metavar="FILE", help="Draw responses, what is left, and S: .png or .svg.")
     ] = None,
     order: Annotated[
-        str | None,
-        typer.Option(
-            metavar="N", help="No parameters: a linear model with so many states, or auto, by the logs alone."
-        ),
+        str | None, typer.Option(metavar="N", help="A linear model alone: its states, or auto; -o is .csv.")
     ] = None,
     record: Annotated[
-        str | None,
-        typer.Option(metavar="SPAN", help="Of any record, without an excitation: its seconds 2..10, or all."),
+        str | None, typer.Option(metavar="SPAN", help="Without an excitation: seconds 2..10 of it, or all.")
     ] = None,
     machine: MachineFile = None,
     time: WholeTime = None,
@@ -101,11 +95,10 @@ def identify(
     What is known only so well widens the total intervals; imperfections of a bench may explain what parameters do not.
     A log that neither explains, or whose S is another one, is refused with exit code 1, and no file is written.
     Of one log masses are known; with --loaded and --added they come out.
-    With --order a linear model is realized without the machine's equations; -o model.csv writes its responses.
 
     \b
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
-              malta identify design/gains/robust.json log.npz --order auto --validate second.npz
+              malta identify design/gains/robust.json log.npz --order auto
     """
     from malta.identification.data_file import write_data
     from malta.identification.identify import GROUPS, identify as identify_parameters, weigh
