@@ -57,7 +57,7 @@ def identify(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="DATA", help="Write a data file, as robust-identified.toml."),
+        typer.Option("--out", "-o", metavar="DATA", help="Write a data file (.toml), or responses (.csv)."),
     ] = None,
     robust: Annotated[
         bool, typer.Option("--robust", help="Take outliers for missing (Student's t).")
@@ -80,7 +80,7 @@ def identify(
         Path | None, typer.Option(metavar="FILE", help="Draw responses, what is left, and S: .png or .svg.")
     ] = None,
     order: Annotated[
-        str | None, typer.Option(metavar="N", help="A linear model alone: its states, or auto; -o is .csv.")
+        str | None, typer.Option(metavar="N", help="A linear model alone: its number of states, or auto.")
     ] = None,
     record: Annotated[
         str | None, typer.Option(metavar="SPAN", help="Without an excitation: seconds 2..10 of it, or all.")
@@ -101,6 +101,7 @@ def identify(
               malta identify design/gains/robust.json log.npz --order auto
     """
     from malta.identification.data_file import write_data
+    from malta.identification.frequency_response import responses_of, write_responses
     from malta.identification.identify import GROUPS, identify as identify_parameters, weigh
     from malta.identification.imperfections import bench_units
     from malta.identification.log_files import read_log
@@ -118,7 +119,7 @@ def identify(
         quality_table,
     )
 
-    require_suffixes((out, (".toml",) if order is None else (".csv",)), (figure, PICTURES))
+    require_suffixes((out, (".csv",) if order else (".toml", ".csv")), (figure, PICTURES))
     alone = {"--record": record, "--loaded": loaded, "--robust": robust, "--drive": drive}
     for option, value in alone.items() if len(logs) > 1 else ():
         if value:
@@ -178,7 +179,11 @@ def identify(
     refusal = found.refusal or ("" if second_look is None else second_look.refusal)
     files = []
     if out is not None and not refusal and not early:
-        files.append(write_data(found, out, gains=str(gains), known=values))
+        files.append(
+            write_data(found, out, gains=str(gains), known=values)
+            if out.suffix.lower() == ".toml"
+            else write_responses(responses_of(found), out)
+        )
     if figure is not None:
         from malta.report.figures import identified_figure, save
 
@@ -248,9 +253,8 @@ def _print_models(gains: Path, found: list[Realization], out: Path | None, *, as
         )
     else:
         console = make_console()
-        print_text(console, f"{model.source}: {model.sentence}")
         for one in found:
-            print_text(console, f"{one.source}: fit at the lines: {one.fit_words}")
+            console.print(str(one), soft_wrap=True)
         print_written(console, files)
     if refusal:
         raise CheckError(refusal)

@@ -16,7 +16,6 @@ law this is the indirect method: the excitation is the instrument, and what the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -30,11 +29,10 @@ from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.identification.frequency_response import FrequencyResponse
-from malta.identification.log import GROUPS, Log
+from malta.identification.log import Log
 from malta.identification.spectra import coefficients_of
 from malta.linear.system import System
 from malta.model.linear.machine import linear_machine
-from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Plant
 from malta.model.signals import Signal
 
@@ -56,14 +54,14 @@ class Lines(NamedTuple):
     """What a record has at its lines: inputs, outputs, and the covariance of both by noise."""
 
     source: str
+    group: str  # of the inputs in a log
     sample_time: float  # s; 0: continuous
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     w: FloatArray  # k, rad/s
     V: ComplexArray  # k x m
     Y: ComplexArray  # k x p
-    noise: ComplexArray  # k x (p + m) x (p + m), outputs first
-    noisy: bool  # whether that was measured
+    noise: ComplexArray  # k x (p + m) x (p + m), outputs first; of a response 1 % of each value
 
     @property
     def p(self) -> ComplexArray:
@@ -78,18 +76,6 @@ class Lines(NamedTuple):
         e, both = self.Y - np.einsum("kpm,km->kp", G, self.V), self.noise @ row
         C = row.conj().transpose(0, 2, 1) @ both
         return e, C, self.V - (both[:, p:] @ np.linalg.solve(C, e[..., None]))[..., 0]
-
-    def fit(self, G: ComplexArray) -> tuple[dict[str, float], dict[str, float], float]:
-        """`fit`, `miss` and |e|^2 over its variance of a response, as a Realization has them."""
-        e, C, _ = self.residuals(G)
-        size, missed = (np.linalg.norm(table, axis=0) for table in (self.Y, e))
-        noise = np.einsum("kpp->p", C).real if self.noisy else 0.0
-        beside = np.sqrt(np.maximum(missed**2 - noise, 0.0)) / size
-        names = [s.name for s in self.outputs]
-        fit, miss = (
-            dict(zip(names, table.tolist(), strict=True)) for table in (100 * (1 - missed / size), beside)
-        )
-        return fit, miss, float((e.conj() * np.linalg.solve(C, e[..., None])[..., 0]).real.sum())
 
 
 class DelayedModel(NamedTuple):
@@ -111,38 +97,25 @@ class DelayedModel(NamedTuple):
 class Realization:
     """A linear model that was realized from a record.
 
-    source : the record
-    group : of the inputs in a log, "v" or "i"
-    inputs, outputs : signals
+    lines : the record at the lines of its excitation, with its source, inputs and outputs
     system : from inputs to outputs without the delay, SI; sampled, unless the record was a continuous response
     delay : of the outputs behind the inputs, s; the hold of a sampled system is not in it
     singular_values : of the stacked outputs without what inputs explain, over those of noise; as many stand out as
         there are states
-    w : lines, rad/s
-    fit : by output, 100 (1 - |Y - G V| / |Y|) at the lines, %
-    miss : by output, |Y - G V| / |Y| beside what noise makes of it
-    chi2 : of the residuals over their degrees of freedom, 1 where noise alone is left; NaN of a response without noise
 
     >>> import malta
     >>> import numpy as np
     >>> from malta.identification import FrequencyResponse
     >>> w = np.geomspace(10, 1000, 30)
     >>> found = malta.realize(FrequencyResponse("P", w, 2 / ((1j * w) ** 2 - 1e4)))
-    >>> found.poles.real.round(3).tolist(), found.plant.name
-    ([-100.0, 100.0], 'realized')
+    >>> found.plant.name, round(found.fit["y"], 6)
+    ('realized', 100.0)
     """
 
-    source: str
-    group: str
-    inputs: tuple[Signal, ...]
-    outputs: tuple[Signal, ...]
+    lines: Lines
     system: System
     delay: float
     singular_values: FloatArray
-    w: FloatArray
-    fit: Mapping[str, float]
-    miss: Mapping[str, float]
-    chi2: float
 
     @property
     def order(self) -> int:
@@ -174,25 +147,63 @@ class Realization:
 
         w : frequencies, rad/s; None: the lines
         """
-        w = np.unique(self.w) if w is None else np.asarray(w, dtype=float)
-        names = [f"P {out.name}/{into.name}" for out in self.outputs for into in self.inputs]
+        w = np.unique(self.lines.w) if w is None else np.asarray(w, dtype=float)
+        names = [f"P {out.name}/{into.name}" for out in self.lines.outputs for into in self.lines.inputs]
         G = self.response(w).reshape(len(w), -1).T
         return {name: FrequencyResponse(name, w, g) for name, g in zip(names, G, strict=True)}
+
+    @cached_property
+    def _residuals(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        return self.lines.residuals(self.response(self.lines.w))
+
+    @property
+    def fit(self) -> dict[str, float]:
+        """By output, 100 (1 - |Y - G V| / |Y|) at the lines, %."""
+        missed = np.linalg.norm(self._residuals[0], axis=0) / np.linalg.norm(self.lines.Y, axis=0)
+        names = [s.name for s in self.lines.outputs]
+        return dict(zip(names, (100 * (1 - missed)).tolist(), strict=True))
+
+    @property
+    def chi2(self) -> float:
+        """The mean square of the residuals in standard deviations: 1 where noise alone is left."""
+        e, C, _ = self._residuals
+        return float((e.conj() * np.linalg.solve(C, e[..., None])[..., 0]).real.mean())
+
+    @property
+    def refusal(self) -> str:
+        """Why the model does not hold for the record of its lines; "": it does."""
+        e, C, _ = self._residuals
+        beside = (np.abs(e) ** 2 - np.einsum("kpp->kp", C).real).sum(axis=0)
+        miss = np.sqrt(np.maximum(beside, 0.0)) / np.linalg.norm(self.lines.Y, axis=0)
+        k = int(miss.argmax())
+        if miss[k] <= MAX_MISS:
+            return ""
+        found = f"{100 * miss[k]:.3g} % of {self.lines.outputs[k].name} on {self.lines.source} beside noise"
+        return f"the model misses {found}, at most {100 * MAX_MISS:g} % are asked"
+
+    def validate(self, record: Any) -> Realization:
+        """The same model with the lines of another record: how well it predicts what it has not seen.
+
+        record : as `malta.realize` takes it, with the same signals
+
+        Raises InputError and CheckError as `malta.realize`.
+        """
+        return replace(self, lines=_require_same(self.lines, _lines_of(record, self.lines.group)))
 
     @cached_property
     def plant(self) -> Plant:
         """The model as a machine x' = A x + B u, y = C x with the delay as its computation time.
 
-        States are the outputs, their rates, and so on, where these determine the state well.
-
-        One parameter, `gain`, multiplies all inputs: a robust margin may ask for it. Raises CheckError for a sampled
-        system that no continuous one has under a hold.
+        States are the outputs, their rates, and so on, where these determine the state well. One parameter, `gain`,
+        multiplies all inputs: a robust margin may ask for it. Raises CheckError for a sampled system that no continuous
+        one has under a hold.
         """
         A, B, C, _ = self.system
         n, m, p, T = len(A), B.shape[1], len(C), self.system.dt
         if T is not None:
             if (np.abs(np.angle(np.linalg.eigvals(A))) > MAX_TURN).any():
-                raise CheckError(f"{self.source}: a pole at half of the sampling rate: choose a lower order")
+                found = "a pole at half of the sampling rate: choose a lower order"
+                raise CheckError(f"{self.lines.source}: {found}")
             held = logm(np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])).real / T
             A, B = held[:n, :n], held[:n, n:]
         rates = np.vstack([C @ np.linalg.matrix_power(A, k) for k in range(-(-n // p))])[:n]
@@ -200,55 +211,22 @@ class Realization:
             A, B, C = rates @ np.linalg.solve(rates.T, A.T).T, rates @ B, np.linalg.solve(rates.T, C.T).T
             A[: max(n - p, 0)], C[:n] = np.eye(n)[p:], np.eye(n)[:p]
         return linear_machine(
-            A, 0 * B, C, name="realized", inputs=self.inputs, outputs=self.outputs, nominal={"gain": 1.0},
+            A, 0 * B, C, name="realized", inputs=self.lines.inputs, outputs=self.lines.outputs, nominal={"gain": 1.0},
             terms={"gain": (None, B)}, computation_time=self.delay,
         )  # fmt: skip
 
-    @cached_property
-    def model(self) -> LinearModel:
-        """The machine's linear model, which `malta.lqg` takes. Raises CheckError as `plant`."""
-        return linearize(self.plant, self.plant.at())
-
-    @property
-    def refusal(self) -> str:
-        """Why the model does not hold for the record of its figures; "": it does."""
-        name = max(self.miss, key=lambda one: self.miss[one])
-        if self.miss[name] <= MAX_MISS:
-            return ""
-        found = f"{100 * self.miss[name]:.3g} % of {name} on {self.source} beside noise"
-        return f"the model misses {found}, at most {100 * MAX_MISS:g} % are asked"
-
-    def validate(self, record: Any) -> Realization:
-        """The same model with the figures that it has on another record: how well it predicts what it has not seen.
-
-        record : as `malta.realize` takes it, with the same signals
-
-        Raises InputError and CheckError as `malta.realize`.
-        """
-        lines = _lines_of(record, self.group)
-        _require_same(self.source, (self.system.dt or 0.0, self.inputs, self.outputs), lines)
-        fit, miss, squares = lines.fit(self.response(lines.w))
-        chi2 = squares / lines.Y.size if lines.noisy else float("nan")
-        return replace(self, source=lines.source, w=readonly(lines.w), fit=fit, miss=miss, chi2=chi2)
-
-    @property
-    def sentence(self) -> str:
-        """Order, delay and unstable poles."""
-        unstable = " ".join(f"{one:.4g}" for one in self.poles.real if one > 0)
-        gap = f"singular values fall {self.gap:.3g} times there"
-        late = f"a delay of {quantity(self.delay, 's')}"
-        return f"{self.order} states ({gap}), {late}, unstable poles [rad/s]: {unstable or 'none'}"
-
-    @property
-    def fit_words(self) -> str:
-        """How well it fits the record of its figures."""
-        return ", ".join(f"{name} {value:.2f} %" for name, value in self.fit.items())
-
     @property
     def description(self) -> Description:
-        """What it is, and how well it fits."""
-        rows = (("model", self.sentence), ("fit", self.fit_words), ("chi2", f"{self.chi2:.3g}"))
-        return Description(f"Model realized from {self.source!r}", rows)
+        """Its states, delay and unstable poles, and how well it fits the record of its lines."""
+        unstable = " ".join(f"{one:.4g}" for one in self.poles.real if one > 0)
+        rows = (
+            ("states", f"{self.order}; singular values fall {self.gap:.3g} times there"),
+            ("delay", quantity(self.delay, "s")),
+            ("unstable", f"poles of {unstable} rad/s" if unstable else "no pole"),
+            ("fit", ", ".join(f"{name} {value:.2f} %" for name, value in self.fit.items())),
+            ("chi2", f"{self.chi2:.3g}"),
+        )
+        return Description(f"Linear model on {self.lines.source!r}", rows)
 
 
 def realize(
@@ -268,22 +246,18 @@ def realize(
     inputs : of a log, "v": commands, or "i": measured currents
     delay : of the outputs behind the inputs, s; None: sought, 0 at least
 
-    Returns a Realization: its `system`, `model` and `plant` are for python-control, `malta.lqg` and `malta.loop`.
+    Returns a Realization: its `plant` is for `malta.lqg` and `malta.loop`, its `system` for python-control.
 
     Raises InputError for signals that are missing, an order beyond the lines, and what is no record. Raises CheckError
     for logs that tell nothing, inputs that do not move independently, and singular values without a gap.
 
     >>> import malta
-    >>> controller = malta.gains.read("design/gains/tubular_pid.json")
-    >>> machine = malta.plant_of(controller.parameters)
-    >>> plan = malta.excite(
-    ...     malta.loop(machine, controller), period=0.5, periods=4, band=(4, 400)
-    ... )
-    >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
-    >>> log = malta.identification.log_of(malta.simulate(machine, controller, excited))
-    >>> found = malta.realize(log)
-    >>> found.order, min(found.fit.values()) > 90
-    (10, True)
+    >>> import numpy as np
+    >>> from malta.identification import FrequencyResponse
+    >>> w = np.geomspace(10, 1000, 30)
+    >>> found = malta.realize(FrequencyResponse("P", w, 2 / ((1j * w) ** 2 - 1e4)))
+    >>> found.order, found.poles.real.round(3).tolist()
+    (2, [-100.0, 100.0])
     """
     lines = _lines_of(source, inputs)
     own, unit, sizes = _in_band_units(lines)
@@ -303,13 +277,7 @@ def realize(
     names = (tuple(one.name for one in signals) for signals in (lines.inputs, lines.outputs))
     A, B = (np.eye(n) + T * A, T * B) if T else (A, B)
     system = System(A, B, C, np.zeros((p, m)), None, T or None, (), *names).balanced
-    fit, miss, squares = own.fit(found.response(own))
-    dof = own.Y.size - n * (p + m) / 2
-    chi2 = squares / dof if lines.noisy and dof > 0 else float("nan")
-    return Realization(
-        lines.source, inputs, lines.inputs, lines.outputs, system, found.delay / unit, readonly(s),
-        readonly(lines.w), fit, miss, chi2,
-    )  # fmt: skip
+    return Realization(lines, system, found.delay / unit, readonly(s))
 
 
 def _lines_of(source: Any, group: str) -> Lines:
@@ -325,30 +293,30 @@ def _lines_of(source: Any, group: str) -> Lines:
     logs = [source] if isinstance(source, Log) else list(source) if isinstance(source, list | tuple) else []
     if not logs or not all(isinstance(log, Log) for log in logs):
         raise InputError("realize", "source", describe(source), "logs, a FrequencyResponse or a control.FRD")
-    if group not in ("v", "i"):
-        raise InputError("realize", "inputs", describe(group), "v or i")
-    parts = [_lines_of_log(log, group) for log in logs]
-    for other in parts[1:]:
-        _require_same(parts[0].source, parts[0][1:4], other)
+    first, *others = [_lines_of_log(log, group) for log in logs]
+    parts = [first, *(_require_same(first, other) for other in others)]
     name = ", ".join(part.source for part in parts)
-    w, V, Y, noise = (np.concatenate(table) for table in zip(*(part[4:8] for part in parts), strict=True))
-    return parts[0]._replace(source=name, w=w, V=V, Y=Y, noise=noise)
+    w, V, Y, noise = (np.concatenate(table) for table in zip(*(part[5:] for part in parts), strict=True))
+    return first._replace(source=name, w=w, V=V, Y=Y, noise=noise)
 
 
-def _require_same(source: str, own: tuple[float, Any, Any], other: Lines) -> None:
-    """Raise InputError for a record with another sample time or other signals than the first one."""
-    if not np.isclose(other.sample_time, own[0], rtol=1e-3) or other[2:4] != own[1:]:
-        raise InputError(other.source, "", "other signals or another sample time", f"those of {source}")
+def _require_same(first: Lines, other: Lines) -> Lines:
+    """The other record. Raises InputError for another sample time or other signals than the first one has."""
+    if not np.isclose(other.sample_time, first.sample_time, rtol=1e-3) or other[3:5] != first[3:5]:
+        raise InputError(other.source, "", "other signals or another sample time", f"those of {first.source}")
+    return other
 
 
 def _lines_of_log(log: Log, group: str) -> Lines:
     for one in ("y", group):
-        if not log.names(one):
-            raise InputError(log.source, one, "no such columns", f"columns {GROUPS[one]}NAME [unit]")
+        if one not in ("y", "v", "i") or not log.names(one):
+            raise InputError(
+                log.source, "inputs", f"no columns of {describe(one)}", "v (commands) or i (currents)"
+            )
     sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
     w, _, (Y, V), noise = coefficients_of(log, sent, [log.columns["y"], log.columns[group]])
     ins, outs = (tuple(Signal(s.name, s.unit) for s in log.signals[one]) for one in (group, "y"))
-    return Lines(log.source, log.sample_time, ins, outs, w, V, Y, noise, True)
+    return Lines(log.source, group, log.sample_time, ins, outs, w, V, Y, noise)
 
 
 def _lines_of_response(
@@ -364,7 +332,7 @@ def _lines_of_response(
     size = RESPONSE_ERROR * np.maximum(np.abs(Y), 1e-3 * np.abs(Y).max(axis=0))
     noise = np.zeros((k * m, p + m, p + m), dtype=complex)
     noise[:, range(p), range(p)] = size**2
-    return Lines(name, T, ins, outs, np.repeat(w, m), V, Y, noise, False)
+    return Lines(name, "v", T, ins, outs, np.repeat(w, m), V, Y, noise)
 
 
 def _in_band_units(lines: Lines) -> tuple[Lines, float, list[FloatArray]]:
@@ -456,7 +424,7 @@ def _best_model(lines: Lines, space: FloatArray, delay: float | None) -> Delayed
         if one.delay < 0:
             one = _likeliest(lines, _first_model(lines, space, 0.0), free=False)
         found.append(one)
-    return min(found, key=lambda model: lines.fit(model.response(lines))[2])
+    return min(found, key=lambda model: float((_white(lines, model)[0] ** 2).sum()))
 
 
 def _likeliest(lines: Lines, model: DelayedModel, *, free: bool) -> DelayedModel:

@@ -452,22 +452,16 @@ def lines_of(log: Log, loop: Loop) -> list[SpectralLine]:
     sent, y = (
         log.table(g, [s.name for s in of]) for g, of in (("excitation", plant.inputs), ("y", plant.outputs))
     )
-    w, D, both, C = coefficients_of(log, sent, [y, commands])
-    (Y, V), p = both, y.shape[1]
-    parts = zip(w.tolist(), D, Y, V, C[:, :p, :p], strict=True)
+    w, D, (Y, V), C = coefficients_of(log, sent, [y, commands])
+    parts = zip(w.tolist(), D, Y, V, C[:, : y.shape[1], : y.shape[1]], strict=True)
     return [SpectralLine(*one) for one in parts]
 
 
 def coefficients_of(
     log: Log, sent: FloatArray, tables: Sequence[FloatArray]
 ) -> tuple[FloatArray, ComplexArray, list[ComplexArray], ComplexArray]:
-    """Fourier coefficients at the lines of the last whole periods of a log.
-
-    sent : its excitation
-    tables : readings, and what else is asked for
-
-    Returns the lines, rad/s; the coefficients there of the excitation and of each table; and the covariance of these
-    by noise, of all columns together. Raises CheckError for a log that tells nothing.
+    """Lines of the last whole periods of a log, rad/s; coefficients there of its excitation and of tables, readings
+    first; and the covariance of these by noise, all columns together. Raises CheckError for a log that tells nothing.
     """
     N, periods = whole_periods(log, last_excitation(log), log.samples)
     ends = np.cumsum([table.shape[1] for table in tables])[:-1]

@@ -507,10 +507,9 @@ class ResponseOutput(DocumentPart):
 class RealizeOutput(DocumentPart):
     """What `malta identify GAINS LOG --order N --json` prints: x+ = A x + B v, y = C x, y late by the delay."""
 
-    READS: ClassVar = {name: f"system.{name}" for name in "ABC"} | {
-        "logs": "source",
-        "sample_time_s": "system.dt",
-    }
+    READS: ClassVar = {
+        **{name: f"system.{name}" for name in "ABC"}, "logs": "lines.source", "sample_time_s": "system.dt"
+    }  # fmt: skip
 
     kind: Literal["malta-realize-output"] = Field(default="malta-realize-output", alias="schema")
     version: Literal[1] = 1
