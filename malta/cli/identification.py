@@ -241,16 +241,11 @@ def _print_models(gains: Path, found: list[Realization], out: Path | None, *, as
     from malta.cli.documents.others import RealizeOutput
     from malta.identification.frequency_response import write_responses
 
-    model, *others = found
-    refusal = "".join(other.refusal for other in others)
+    model, fresh = found[0], found[1] if len(found) > 1 else None
+    refusal, fit = ("", None) if fresh is None else (fresh.refusal, fresh.fit)
     files = [] if out is None or refusal else [write_responses(model.responses(), out)]
     if as_json:
-        fits = [other.fit for other in others]
-        print_document(
-            RealizeOutput.of(
-                model, gains=gains, fresh_fit=fits[0] if fits else None, refusal=refusal, files=files
-            )
-        )
+        print_document(RealizeOutput.of(model, gains=gains, fresh_fit=fit, refusal=refusal, files=files))
     else:
         console = make_console()
         for one in found:

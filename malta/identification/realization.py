@@ -125,7 +125,8 @@ class Realization:
     @property
     def gap(self) -> float:
         """The singular value of the last state over the next one, or over 1, which noise has."""
-        return float(_gaps(self.singular_values)[self.order - 1])
+        s, n = self.singular_values, self.order
+        return float(s[n - 1] / s[n : n + 1].max(initial=1.0))
 
     @cached_property
     def poles(self) -> ComplexArray:
@@ -142,12 +143,9 @@ class Realization:
         s = 1j * w if T is None else np.exp(1j * w * T)
         return np.asarray(self.system.response(s) * np.exp(-1j * w * self.delay)[:, None, None])
 
-    def responses(self, w: FloatArray | None = None) -> dict[str, FrequencyResponse]:
-        """The responses by name, "P x1/fx_B1" from the input fx_B1 to the output x1, as of `responses_of`.
-
-        w : frequencies, rad/s; None: the lines
-        """
-        w = np.unique(self.lines.w) if w is None else np.asarray(w, dtype=float)
+    def responses(self) -> dict[str, FrequencyResponse]:
+        """The responses at the lines, by name: "P x1/fx_B1" from the input fx_B1 to the output x1."""
+        w = np.unique(self.lines.w)
         names = [f"P {out.name}/{into.name}" for out in self.lines.outputs for into in self.lines.inputs]
         G = self.response(w).reshape(len(w), -1).T
         return {name: FrequencyResponse(name, w, g) for name, g in zip(names, G, strict=True)}
@@ -271,13 +269,17 @@ def realize(
     if delay is not None and not (is_number(delay) and delay >= 0):
         raise InputError("realize", "delay", describe(delay), "a time of 0 s or more")
     s, space = _output_space(own, rows)
-    n = order or _clear_order(own.source, s, most)
-    found = _best_model(own, space[:, :n], None if delay is None else delay * unit)
-    A, B, C, T = found.A * unit, found.B * unit / sizes[1], found.C * sizes[0][:, None], lines.sample_time
+    gaps = (s / np.maximum(np.append(s[1:], 0.0), 1.0))[:most]
+    n = order or int(gaps.argmax()) + 1
+    if order is None and gaps[n - 1] < MIN_GAP:
+        found = " ".join(f"{one:.3g}" for one in s[:most])
+        raise CheckError(f"{lines.source}: singular values {found} have no gap that tells an order: name one")
+    model = _best_model(own, space[:, :n], None if delay is None else delay * unit)
+    A, B, C, T = model.A * unit, model.B * unit / sizes[1], model.C * sizes[0][:, None], lines.sample_time
     names = (tuple(one.name for one in signals) for signals in (lines.inputs, lines.outputs))
     A, B = (np.eye(n) + T * A, T * B) if T else (A, B)
     system = System(A, B, C, np.zeros((p, m)), None, T or None, (), *names).balanced
-    return Realization(lines, system, found.delay / unit, readonly(s))
+    return Realization(lines, system, model.delay / unit, readonly(s))
 
 
 def _lines_of(source: Any, group: str) -> Lines:
@@ -286,8 +288,7 @@ def _lines_of(source: Any, group: str) -> Lines:
         one = Signal("u", "1"), Signal("y", source.unit or "1")
         return _lines_of_response(source.name, 0.0, one[:1], one[1:], source.w, source.values[:, None, None])
     if all(hasattr(source, name) for name in ("omega", "frdata", "input_labels")):
-        labels = source.input_labels, source.output_labels
-        ins, outs = (tuple(Signal(str(name), "1") for name in names) for names in labels)
+        ins, outs = (tuple(Signal(n, "1") for n in of) for of in (source.input_labels, source.output_labels))
         T = 0.0 if source.dt in (None, True) else float(source.dt)
         return _lines_of_response("FRD", T, ins, outs, source.omega, np.moveaxis(source.frdata, 2, 0))
     logs = [source] if isinstance(source, Log) else list(source) if isinstance(source, list | tuple) else []
@@ -371,20 +372,6 @@ def _output_space(lines: Lines, rows: int) -> tuple[FloatArray, FloatArray]:
     L = np.kron(np.linalg.cholesky(noise), np.eye(p))
     directions, s, _ = np.linalg.svd(np.linalg.solve(L, R[len(V) :, len(V) :]))
     return s, L @ directions
-
-
-def _clear_order(source: str, s: FloatArray, most: int) -> int:
-    """The place of the largest gap between singular values. Raises CheckError where none is clear."""
-    ratios = _gaps(s)[:most]
-    n = int(ratios.argmax()) + 1
-    if ratios[n - 1] < MIN_GAP:
-        found = " ".join(f"{one:.3g}" for one in s[:most])
-        raise CheckError(f"{source}: singular values {found} have no gap that tells an order: name one")
-    return n
-
-
-def _gaps(s: FloatArray) -> FloatArray:
-    return np.asarray(s / np.maximum(np.append(s[1:], 0.0), 1.0))
 
 
 def _resolvents(A: FloatArray, p: ComplexArray) -> ComplexArray:

@@ -464,7 +464,6 @@ def coefficients_of(
     first; and the covariance of these by noise, all columns together. Raises CheckError for a log that tells nothing.
     """
     N, periods = whole_periods(log, last_excitation(log), log.samples)
-    ends = np.cumsum([table.shape[1] for table in tables])[:-1]
     Z: Any
     if isinstance(sent, StoredTable):
         D = fold_excitation(log, sent, N, periods)
@@ -481,7 +480,7 @@ def coefficients_of(
     if np.median(power) < MIN_LINE_POWER:
         raise CheckError(f"{log.source}: the excitation does not rise above the noise at half of the lines")
     w = 2 * np.pi / (N * log.sample_time) * lines
-    return w, D, np.split(Z[lines], ends, axis=1), C
+    return w, D, np.split(Z[lines], np.cumsum([table.shape[1] for table in tables])[:-1], axis=1), C
 
 
 def _fill(table: FloatArray, log: Log) -> FloatArray:

@@ -519,7 +519,6 @@ class RealizeOutput(DocumentPart):
     sample_time_s: float
     delay_s: float
     singular_values: list[float]
-    gap: Number = Field(description="the last singular value of the model over the first that is left out")
     chi2: Number = Field(description="1 where noise alone is left")
     fit: dict[str, float] = Field(description="by output, at the lines, %")
     fresh_fit: dict[str, float] | None = Field(description="of a second log, %")
