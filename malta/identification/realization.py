@@ -42,6 +42,7 @@ LEAST_POWER = 1e-10  # of stacked noise in any direction, as a share of a line's
 MIN_GAP = 7.0  # between singular values, which tells an order
 MIN_MOTION = 1e-6  # of the inputs, least of any direction beside the largest
 QUIET_SHARE = 1e-6  # of an output, least noise that its lines are taken to have
+MAX_VALUE = 1e100  # of a response, whose square is a number
 RESPONSE_ERROR = 0.01  # of a response without noise, beside which its lines are weighed
 MAX_STEPS = 100  # of a refinement
 STEP_GAIN = 1e-6  # of chi2: a step that gains less is the last one
@@ -192,7 +193,7 @@ class Realization:
     def plant(self) -> Plant:
         """The model as a machine x' = A x + B u, y = C x with the delay as its computation time.
 
-        States are the outputs, their rates, and so on, where these determine the state well. One parameter, `gain`,
+        States are the outputs and their rates, where these determine the state well. One parameter, `gain`,
         multiplies all inputs: a robust margin may ask for it. Raises CheckError for a sampled system that no continuous
         one has under a hold.
         """
@@ -200,12 +201,12 @@ class Realization:
         n, m, p, T = len(A), B.shape[1], len(C), self.system.dt
         if T is not None:
             if (np.abs(np.angle(np.linalg.eigvals(A))) > MAX_TURN).any():
-                found = "a pole at half of the sampling rate: choose a lower order"
-                raise CheckError(f"{self.lines.source}: {found}")
+                raise CheckError(f"{self.lines.source}: a pole at half the sampling rate: name another order")
             held = logm(np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])).real / T
             A, B = held[:n, :n], held[:n, n:]
-        rates = np.vstack([C @ np.linalg.matrix_power(A, k) for k in range(-(-n // p))])[:n]
-        if np.linalg.cond(rates / np.linalg.norm(rates, axis=1, keepdims=True)) < MAX_CONDITION:
+        rates = np.vstack([C, C @ A])[:n]
+        size = np.linalg.norm(rates, axis=1, keepdims=True)
+        if len(rates) == n and np.linalg.cond(rates / size) < MAX_CONDITION:
             A, B, C = rates @ np.linalg.solve(rates.T, A.T).T, rates @ B, np.linalg.solve(rates.T, C.T).T
             A[: max(n - p, 0)], C[:n] = np.eye(n)[p:], np.eye(n)[:p]
         return linear_machine(
@@ -221,7 +222,7 @@ class Realization:
             ("states", f"{self.order}; singular values fall {self.gap:.3g} times there"),
             ("delay", quantity(self.delay, "s")),
             ("unstable", f"poles of {unstable} rad/s" if unstable else "no pole"),
-            ("fit", ", ".join(f"{name} {value:.2f} %" for name, value in self.fit.items())),
+            ("fit [%]", ", ".join(f"{name} {value:.2f}" for name, value in self.fit.items())),
             ("chi2", f"{self.chi2:.3g}"),
         )
         return Description(f"Linear model on {self.lines.source!r}", rows)
@@ -263,7 +264,7 @@ def realize(
     asked = order if isinstance(order, int) else 0
     rows = min(-(-max(ROWS, 3 * p, asked) // p) + 1, int(COLUMN_SHARE * 2 * len(own.w) / (p + m)))
     most = max(0, (rows - 1) * p)
-    if most < 1 or (order is not None and not (isinstance(order, int) and 1 <= order <= most)):
+    if most < 1 or (order is not None and not (type(order) is int and 1 <= order <= most)):
         wanted = f"1 to {most}, or more lines than {len(own.w)}" if most else f"more lines than {len(own.w)}"
         raise InputError("realize", "order", describe(order), wanted)
     if delay is not None and not (is_number(delay) and delay >= 0):
@@ -325,9 +326,10 @@ def _lines_of_response(
 ) -> Lines:
     """A line for each input at each frequency, weighed by the size of what it moves."""
     w, G = np.asarray(w, dtype=float), np.asarray(G, dtype=complex)
-    if not np.isfinite(G).all() or (w <= 0).any() or (T and (w >= np.pi / T).any()):
-        found = "frequencies or values out of range"
-        raise InputError("realize", name, found, "finite values, between 0 and half of the sampling rate")
+    rising = len(w) == len(G) and (np.diff(w, prepend=0.0) > 0).all() and not (T and (w >= np.pi / T).any())
+    if not rising or not (np.abs(G) < MAX_VALUE).all():
+        expected = "finite values at rising frequencies, above 0 and below half of the sampling rate"
+        raise InputError("realize", name, "frequencies or values out of range", expected)
     k, p, m = G.shape
     Y, V = G.transpose(0, 2, 1).reshape(k * m, p), np.tile(np.eye(m, dtype=complex), (k, 1))
     size = RESPONSE_ERROR * np.maximum(np.abs(Y), 1e-3 * np.abs(Y).max(axis=0))

@@ -476,7 +476,7 @@ def coefficients_of(
         D = D[lines]
     C = _noise(Z, lines, periods)
     p = tables[0].shape[1]
-    power = (np.abs(Z[lines][:, :p]) ** 2 / np.einsum("kpp->kp", C[:, :p, :p]).real).max(axis=1)
+    power = (np.abs(Z[lines][:, :p]) ** 2 / np.einsum("kpp->kp", C[:, :p, :p]).real.clip(1e-300)).max(axis=1)
     if np.median(power) < MIN_LINE_POWER:
         raise CheckError(f"{log.source}: the excitation does not rise above the noise at half of the lines")
     w = 2 * np.pi / (N * log.sample_time) * lines
@@ -502,9 +502,7 @@ def _noise(Y: ComplexArray, lines: Any, periods: int) -> ComplexArray:
     others = np.setdiff1d(np.arange(lines[0], lines[-1], periods), lines)
     if len(others):
         near = np.abs(lines - others[:, None]).argmin(axis=1)
-        quiet = np.maximum(
-            np.einsum("kpp->kp", C[near]).real, 1e-300
-        )  # commands without feedback have no noise
+        quiet = np.einsum("kpp->kp", C[near]).real.clip(1e-300)  # 0 of commands without feedback
         ratio = (np.abs(Y[others]) ** 2 / quiet).mean(axis=0)
         grown = np.sqrt(np.maximum(ratio, 1.0))
         C = C * np.outer(grown, grown)

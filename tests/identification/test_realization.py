@@ -82,6 +82,7 @@ def test_poles_delay_and_response_are_those_of_the_machine() -> None:
     model = malta.linearize(found.plant, found.plant.at())
     assert np.sort(np.linalg.eigvals(model.A).real) == pytest.approx(found.poles.real)
     assert model.A[:2] == pytest.approx(np.eye(4)[2:])  # positions, then their rates
+    assert len(malta.realize(record(0, noise=0.0, periods=5)).plant.states) == 6  # the delay's too
     fresh = found.validate(record(1))
     assert fresh.refusal == ""
     assert min(fresh.fit.values()) > 99.5
@@ -172,6 +173,11 @@ def test_what_tells_no_model_is_refused_in_a_sentence() -> None:
         (lambda: malta.realize(log, 4, delay=-1.0), "delay: found -1.0, expected a time of 0 s or more"),
         (lambda: malta.realize(FrequencyResponse("G", w[:2], w[:2] + 0j)), "more lines than 2"),
         (lambda: malta.realize(FrequencyResponse("G", w, np.full(10, np.nan))), "expected finite values"),
+        (lambda: malta.realize(FrequencyResponse("G", 0 * w, 1 / (1j * w + 5))), "at rising frequencies"),
+        (lambda: malta.realize(FrequencyResponse("G", w, 1e300 / (1j * w + 5))), "expected finite values"),
+        (lambda: malta.realize(FrequencyResponse("G", w, np.ones(9, dtype=complex))), "out of range"),
+        (lambda: malta.realize(replace(log, columns={**log.columns, "y": 0 * log.columns["y"]})), "noise"),
+        (lambda: malta.realize(log, 3).plant, "a pole at half the sampling rate: name another order"),
         (lambda: malta.realize(line).validate(log), "expected those of G"),
         (lambda: malta.realize(replace(log, columns=none)), "nothing was excited"),
         (lambda: malta.realize(replace(log, columns=both)), "do not move independently"),
