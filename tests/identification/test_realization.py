@@ -20,7 +20,8 @@ from conftest import Run, one_sentence
 from scipy.linalg import expm
 
 import malta
-from malta.identification import FrequencyResponse, Log, log_of, read_response, write_log
+from malta.identification import FrequencyResponse, Log, log_files, log_of, read_log, read_response, write_log
+from malta.identification.readers.stored import StoredTable
 from malta.model import Signal
 from malta.synthesis.law_system import law_system
 
@@ -105,6 +106,20 @@ def test_logs_that_excite_an_input_each_are_taken_together() -> None:
     other = replace(record(0, periods=4), sample_time=2 * T, period=2 * T * PERIOD)
     with pytest.raises(malta.InputError, match="another sample time, expected those of hidden"):
         malta.realize([record(0, periods=4), other])
+
+
+def test_a_log_that_stays_in_its_file_gives_the_same_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_log(record(0, periods=5), tmp_path / "log.npz")
+    known = malta.realize(read_log(path))
+    monkeypatch.setattr(log_files, "MOST_IN_MEMORY", 1000)
+    monkeypatch.setattr(log_files, "SMALL_ARRAY", 100)
+    long = read_log(path)
+    assert isinstance(long.columns["y"], StoredTable)
+    found = malta.realize(long)
+    assert found.poles == pytest.approx(known.poles, rel=1e-6)
+    assert found.delay == pytest.approx(known.delay, rel=1e-4)
 
 
 def test_a_law_of_the_model_holds_the_machine() -> None:
