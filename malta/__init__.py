@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn
     from malta.identification.measure import measure as measure
+    from malta.identification.realization import realize as realize
     from malta.loops.loop import loop as loop
     from malta.loops.uncertain_models import uncertain as uncertain
     from malta.margins.safe_loads import safe_load as safe_load, safe_start as safe_start
@@ -97,6 +98,7 @@ _NAMES = {
     "malta.identification.identify": "identify",
     "malta.identification.learn": "learn",
     "malta.identification.measure": "measure",
+    "malta.identification.realization": "realize",
     "malta.loops.loop": "loop",
     "malta.loops.uncertain_models": "uncertain",
     "malta.margins.safe_loads": "safe_load safe_start",

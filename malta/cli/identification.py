@@ -29,7 +29,8 @@ from malta.files import PICTURES
 from malta.work import is_stopped
 
 if TYPE_CHECKING:
-    pass
+    from malta.identification.realization import Realization
+    from malta.synthesis.controller import Controller
 
 
 @add_log_options
@@ -56,23 +57,21 @@ def identify(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="DATA", help="Write a data file, as robust-identified.toml."),
+        typer.Option("--out", "-o", metavar="DATA", help="Write a data file (.toml), or responses (.csv)."),
     ] = None,
     robust: Annotated[
         bool, typer.Option("--robust", help="Take outliers for missing (Student's t).")
     ] = False,
     loaded: Annotated[
         Path | None,
-        typer.Option(
-            metavar="LOG", help="A second log, with a known mass on the machine: the mass comes out."
-        ),
+        typer.Option(metavar="LOG", help="A second log, with a known mass on it: that comes out."),
     ] = None,
     added: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="What it adds to a parameter, as m=100g. Repeatable."),
     ] = None,
     drive: Annotated[
-        bool, typer.Option("--drive", help="R, L and dead time of the drive too, from voltages in the log.")
+        bool, typer.Option("--drive", help="R, L and dead time of the drive, from voltages.")
     ] = False,
     fresh: Annotated[
         Path | None, typer.Option("--validate", metavar="LOG", help="A second log, to be predicted.")
@@ -80,9 +79,11 @@ def identify(
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw responses, what is left, and S: .png or .svg.")
     ] = None,
+    order: Annotated[
+        str | None, typer.Option(metavar="N", help="A linear model alone: its number of states, or auto.")
+    ] = None,
     record: Annotated[
-        str | None,
-        typer.Option(metavar="SPAN", help="Of any record, without an excitation: its seconds 2..10, or all."),
+        str | None, typer.Option(metavar="SPAN", help="Without an excitation: seconds 2..10 of it, or all.")
     ] = None,
     machine: MachineFile = None,
     time: WholeTime = None,
@@ -97,8 +98,10 @@ def identify(
 
     \b
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
+              malta identify design/gains/robust.json log.npz --order auto
     """
     from malta.identification.data_file import write_data
+    from malta.identification.frequency_response import responses_of, write_responses
     from malta.identification.identify import GROUPS, identify as identify_parameters, weigh
     from malta.identification.imperfections import bench_units
     from malta.identification.log_files import read_log
@@ -116,13 +119,21 @@ def identify(
         quality_table,
     )
 
-    require_suffixes((out, (".toml",)), (figure, PICTURES))
+    require_suffixes((out, (".csv",) if order else (".toml", ".csv")), (figure, PICTURES))
     alone = {"--record": record, "--loaded": loaded, "--robust": robust, "--drive": drive}
     for option, value in alone.items() if len(logs) > 1 else ():
         if value:
             raise InputError(option, "", f"{len(logs)} logs", "one log")
     log = ", ".join(map(str, logs))
     controller = read_controller(gains, machine)
+    if order is not None:
+        given = {"-p": parameters, "--known": known, "--added": added, "--figure": figure, **alone}
+        for option in [option for option, value in given.items() if value][:1]:
+            raise InputError("--order", "", f"{option} beside it", "one of them")
+        with work_until(f"realizing from {log}", time):
+            models = _realize(controller, order, logs, fresh, reading)
+        _print_models(gains, models, out, as_json=as_json)
+        return
     believed = plant_of(controller.parameters)
     values = read_known(known, units_of_model(believed) | bench_units(believed))
     more = read_assignments("--added", added, units_of_model(believed))
@@ -168,7 +179,11 @@ def identify(
     refusal = found.refusal or ("" if second_look is None else second_look.refusal)
     files = []
     if out is not None and not refusal and not early:
-        files.append(write_data(found, out, gains=str(gains), known=values))
+        files.append(
+            write_data(found, out, gains=str(gains), known=values)
+            if out.suffix.lower() == ".toml"
+            else write_responses(responses_of(found), out)
+        )
     if figure is not None:
         from malta.report.figures import identified_figure, save
 
@@ -202,6 +217,42 @@ def identify(
     refusal = refusal or (windings.refusal if windings is not None else "")
     if refusal:
         raise CheckError(f"{log}: {refusal}")
+
+
+def _realize(
+    controller: Controller, order: str, logs: list[Path], fresh: Path | None, reading: Reading
+) -> list[Realization]:
+    """A linear model of logs alone, and the same with its figures on a fresh log. Raises InputError for its order."""
+    from malta.identification.log import in_order
+    from malta.identification.log_files import read_log
+    from malta.identification.realization import realize
+    from malta.model.plants import plant_of
+
+    if not (order == "auto" or order.isdecimal()):
+        raise InputError("--order", "", repr(order), "a number of states, or auto")
+    plant, groups = plant_of(controller.parameters), ("y", "v", "excitation")
+    read = [in_order(read_log(one, groups, **reading), plant) for one in (*logs, *([fresh] if fresh else []))]
+    found = realize(read[: len(logs)], None if order == "auto" else int(order))
+    return [found, *(found.validate(log) for log in read[len(logs) :])]
+
+
+def _print_models(gains: Path, found: list[Realization], out: Path | None, *, as_json: bool) -> None:
+    """Print a model of logs alone, and write its responses. Raises CheckError where the fresh log refuses it."""
+    from malta.cli.documents.others import RealizeOutput
+    from malta.identification.frequency_response import write_responses
+
+    model, fresh = found[0], found[1] if len(found) > 1 else None
+    refusal, fit = ("", None) if fresh is None else (fresh.refusal, fresh.fit)
+    files = [] if out is None or refusal else [write_responses(model.responses(), out)]
+    if as_json:
+        print_document(RealizeOutput.of(model, gains=gains, fresh_fit=fit, refusal=refusal, files=files))
+    else:
+        console = make_console()
+        for one in found:
+            console.print(str(one), soft_wrap=True)
+        print_written(console, files)
+    if refusal:
+        raise CheckError(refusal)
 
 
 def read_span(option: str, text: str) -> tuple[float, float]:

@@ -34,6 +34,9 @@ def log(
             metavar="FILE", help="Draw it: a page to zoom in (.html), or .png, .svg, .pdf. Live: .csv."
         ),
     ] = None,
+    spectrogram: Annotated[
+        bool, typer.Option("--spectrogram", help="Draw amplitudes over time and frequency too.")
+    ] = False,
     live: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS:PORT", help="Of an XCP slave; LOG is the NAME.a2l of its export."),
@@ -72,7 +75,9 @@ def log(
     from malta.identification.survey import SOUND_LOG
     from malta.report.tables.experiments import log_table
 
-    require_suffixes((out, (".html", *PICTURES)))
+    if spectrogram and out is None:
+        raise InputError("--spectrogram", "", "no --out", "--out NAME.png beside it")
+    require_suffixes((out, PICTURES if spectrogram else (".html", *PICTURES)))
     found = read_log(file, **reading)
     beyond = [] if gains is None else findings_of_machine(read_controller(gains, machine), found)
     files = []
@@ -83,7 +88,7 @@ def log(
     elif out is not None:
         from malta.report.figures import log_figure, save
 
-        files.append(save(log_figure(found), out))
+        files.append(save(log_figure(found, spectrogram=spectrogram), out))
     if as_json:
         from malta.cli.documents.others import log_output
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         MeasurementPlan as MeasurementPlan,
         plan_measurement as plan_measurement,
     )
+    from malta.identification.realization import Realization as Realization
     from malta.identification.record_fit import RecordFit as RecordFit
     from malta.identification.records import identify_record as identify_record
     from malta.identification.replay import LawReplay as LawReplay, replay_law as replay_law
@@ -47,6 +48,7 @@ _NAMES = {
     "malta.identification.log": "Log log_of",
     "malta.identification.log_files": "read_log write_log",
     "malta.identification.measure": "Measurement MeasurementPlan plan_measurement",
+    "malta.identification.realization": "Realization",
     "malta.identification.record_fit": "RecordFit",
     "malta.identification.records": "identify_record",
     "malta.identification.replay": "LawReplay replay_law",

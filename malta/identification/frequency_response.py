@@ -17,9 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.arrays import readonly
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.files import require_suffix
-from malta.identification.measure import MAX_MODEL_ERROR, MAX_TUBE_ERROR, loop_curves, machines_of
+from malta.identification.measure import (
+    MAX_MODEL_ERROR,
+    MAX_TUBE_ERROR,
+    Measurement,
+    loop_curves,
+    machines_of,
+)
 from malta.identification.readers.text import text_log
 from malta.loops.loop import loop
 from malta.model.plants import plant_of
@@ -28,7 +34,7 @@ from malta.writing import replace_files
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray
-    from malta.identification.measure import Measurement
+    from malta.identification.identified import Identified
     from malta.synthesis.controller import Controller
 
 MAX_RESPONSE_ERROR = 0.05  # of the predicted magnitude, by which a response without bands may miss its tube
@@ -77,12 +83,14 @@ class FrequencyResponse:
         return control.frd(self.values[None, None, :], self.w, name=re.sub(r"\W", "_", self.name))
 
 
-def responses_of(measured: Measurement) -> dict[str, FrequencyResponse]:
-    """The responses of a measured loop by name: S, T and L of each sensor, and SP from each force.
+def responses_of(found: Measurement | Identified) -> dict[str, FrequencyResponse]:
+    """The responses of a loop by name: S, T and L of each sensor, and SP from each force.
 
-    measured : from `malta.measure`
+    found : as measured, from `malta.measure`; or an identified machine: those of its loop at the lines of its log
 
     Returns a dict: "S x1", "T x1", "L x1", "SP x1/fx_B1" and the others, each a FrequencyResponse.
+
+    Raises CheckError for a machine whose log tells no S.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -97,13 +105,18 @@ def responses_of(measured: Measurement) -> dict[str, FrequencyResponse]:
     >>> len(found), found["S x1"].to_control().ninputs
     (40, 1)
     """
-    found = {}
+    measured, which = found, "measured"
+    if not isinstance(measured, Measurement):
+        if measured.loop is None:
+            raise CheckError(f"{measured.log.source}: tells no S: there are no lines for responses")
+        measured, which = measured.loop.measured, "predicted"
+    curves = {}
     for i, sensor in enumerate(measured.sensors):
         for kind in ("S", "T", "L"):
-            found[f"{kind} {sensor}"] = getattr(measured, kind).measured[:, i]
+            curves[f"{kind} {sensor}"] = getattr(getattr(measured, kind), which)[:, i]
         for j, force in enumerate(measured.forces):
-            found[f"SP {sensor}/{force}"] = measured.compliance.measured[:, i, j]
-    return {name: FrequencyResponse(name, measured.w, values) for name, values in found.items()}
+            curves[f"SP {sensor}/{force}"] = getattr(measured.compliance, which)[:, i, j]
+    return {name: FrequencyResponse(name, measured.w, values) for name, values in curves.items()}
 
 
 def write_responses(responses: Mapping[str, FrequencyResponse], path: str | Path) -> Path:
@@ -282,7 +295,8 @@ def compare_response(
 
     controller : the gain file that was running
     response : as read from a file
-    of : "S SENSOR", "T SENSOR", "L SENSOR" or "SP SENSOR/FORCE"; "": as the response is called
+    of : "S SENSOR", "T SENSOR", "L SENSOR", "SP SENSOR/FORCE" or, of the machine alone from commands to readings,
+        "P SENSOR/FORCE"; "": as the response is called
     parameters : of the machine that is predicted; None: those of the controller
     uncertainty : by parameter: half width of the box as a share; None or {}: none
     seed : of the sampled machines
@@ -326,7 +340,8 @@ def _places(sensors: Sequence[str], forces: Sequence[str]) -> dict[str, tuple[in
         f"{kind} {sensor}": (k, (i,)) for k, kind in enumerate("STL") for i, sensor in enumerate(sensors)
     }
     return found | {
-        f"SP {sensor}/{force}": (3, (i, j))
+        f"{kind} {sensor}/{force}": (k, (i, j))
+        for k, kind in ((3, "SP"), (4, "P"))
         for i, sensor in enumerate(sensors)
         for j, force in enumerate(forces)
     }

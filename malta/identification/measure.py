@@ -427,8 +427,9 @@ def sensitivity_of(columns: ResponseColumns, cut: Cut) -> ComplexArray:
 
 
 def loop_curves(loop: Loop, w: FloatArray) -> tuple[ComplexArray, ...]:
-    """S, T and L of each sensor, k x p, and S P, k x p x m, of a loop at frequencies below the Nyquist one, rad/s."""
-    return _predict_responses(cut_loop(loop, w))[:4]
+    """S, T and L of each sensor, k x p, and S P and P, k x p x m, of a loop at frequencies below Nyquist's, rad/s."""
+    cut = cut_loop(loop, w)
+    return *_predict_responses(cut)[:4], cut.P
 
 
 def _predict_responses(cut: Cut) -> tuple[ComplexArray, ...]:

@@ -446,32 +446,41 @@ def lines_of(log: Log, loop: Loop) -> list[SpectralLine]:
     plant = loop.plant
     require_log(log, plant.name, loop.sample_time)
     log = in_order(log, plant)
-    N, periods = whole_periods(log, last_excitation(log), log.samples)
     commands = (
         log.table("v", [s.name for s in plant.inputs]) if log.names("v") else np.zeros((log.samples, 0))
     )
     sent, y = (
         log.table(g, [s.name for s in of]) for g, of in (("excitation", plant.inputs), ("y", plant.outputs))
     )
-    Y: Any
-    V: Any
+    w, D, (Y, V), C = coefficients_of(log, sent, [y, commands])
+    parts = zip(w.tolist(), D, Y, V, C[:, : y.shape[1], : y.shape[1]], strict=True)
+    return [SpectralLine(*one) for one in parts]
+
+
+def coefficients_of(
+    log: Log, sent: FloatArray, tables: Sequence[FloatArray]
+) -> tuple[FloatArray, ComplexArray, list[ComplexArray], ComplexArray]:
+    """Lines of the last whole periods of a log, rad/s; coefficients there of its excitation and of tables, readings
+    first; and the covariance of these by noise, all columns together. Raises CheckError for a log that tells nothing.
+    """
+    N, periods = whole_periods(log, last_excitation(log), log.samples)
+    Z: Any
     if isinstance(sent, StoredTable):
         D = fold_excitation(log, sent, N, periods)
         at = excited_lines(log, D, 1)
-        both = fold([_fill(y, log), _fill(commands, log)], N, periods, int(at[-1]) + 5)
-        Y, V = both.columns(0, y.shape[1]), both.columns(y.shape[1], both.shape[1])
+        Z = fold([_fill(table, log) for table in tables], N, periods, int(at[-1]) + 5)
         lines, D = periods * at, D[at]
     else:
-        D, Y, V = (np.fft.rfft(_fill(table, log)[-N:], axis=0) / N for table in (sent, y, commands))
-        lines = excited_lines(log, D, periods)
+        D, *parts = (np.fft.rfft(_fill(table, log)[-N:], axis=0) / N for table in (sent, *tables))
+        Z, lines = np.hstack(parts), excited_lines(log, D, periods)
         D = D[lines]
-    C = _noise(Y, lines, periods)
-    power = (np.abs(Y[lines]) ** 2 / np.einsum("kpp->kp", C).real).max(axis=1)
+    C = _noise(Z, lines, periods)
+    p = tables[0].shape[1]
+    power = (np.abs(Z[lines][:, :p]) ** 2 / np.einsum("kpp->kp", C[:, :p, :p]).real.clip(1e-300)).max(axis=1)
     if np.median(power) < MIN_LINE_POWER:
         raise CheckError(f"{log.source}: the excitation does not rise above the noise at half of the lines")
-    rate = 2 * np.pi / (N * log.sample_time)
-    parts = zip(lines.tolist(), D, Y[lines], V[lines], C, strict=True)
-    return [SpectralLine(rate * k, d, at_line, v, c) for k, d, at_line, v, c in parts]
+    w = 2 * np.pi / (N * log.sample_time) * lines
+    return w, D, np.split(Z[lines], np.cumsum([table.shape[1] for table in tables])[:-1], axis=1), C
 
 
 def _fill(table: FloatArray, log: Log) -> FloatArray:
@@ -493,7 +502,8 @@ def _noise(Y: ComplexArray, lines: Any, periods: int) -> ComplexArray:
     others = np.setdiff1d(np.arange(lines[0], lines[-1], periods), lines)
     if len(others):
         near = np.abs(lines - others[:, None]).argmin(axis=1)
-        ratio = (np.abs(Y[others]) ** 2 / np.einsum("kpp->kp", C[near]).real).mean(axis=0)
+        quiet = np.einsum("kpp->kp", C[near]).real.clip(1e-300)  # 0 of commands without feedback
+        ratio = (np.abs(Y[others]) ** 2 / quiet).mean(axis=0)
         grown = np.sqrt(np.maximum(ratio, 1.0))
         C = C * np.outer(grown, grown)
     return np.asarray(C)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,34 @@ def test_a_response_is_judged_by_the_machine(predicted: FrequencyResponse) -> No
     high = FrequencyResponse("S x1", np.array([10.0, 1e6]), np.ones(2, dtype=complex))
     with pytest.raises(malta.InputError, match="frequencies below 1e\\+04 Hz"):
         compare_response(CONTROLLER, high)
+
+
+def test_the_machine_alone_is_that_of_its_loop() -> None:
+    """P of a command by the loop's pieces, S P = S times it, and by the responses of the nominal loop."""
+    loop = malta.loop(malta.plant_of(CONTROLLER.parameters), CONTROLLER)
+    P, _ = loop.nominal.response(W)
+    curves = loop_curves(loop, W)
+    assert curves[4] == pytest.approx(P, rel=1e-6, abs=1e-9 * np.abs(P).max())
+    assert curves[3] == pytest.approx(loop.sensitivity(W) @ P, rel=1e-5, abs=1e-8 * np.abs(P).max())
+    one = FrequencyResponse("P x1/fx_B1", W, P[:, 0, 0])
+    assert compare_response(CONTROLLER, one).error.max() < 1e-5
+
+
+@pytest.mark.slow
+def test_an_identified_machine_writes_its_responses(tmp_path: Path, run: Run) -> None:
+    """They are those of the loop with its parameters, at the lines."""
+    believed = malta.plant_of(CONTROLLER.parameters)
+    true = believed.variant(replace(believed.parameters, K_A=9000.0))
+    plan = malta.excite(malta.loop(believed, CONTROLLER), period=0.5, periods=4, band=(4, 400))
+    flight = malta.simulate(true, CONTROLLER, malta.Scenario.excited(plan.signal, plan.duration))
+    path = malta.identification.write_log(malta.identification.log_of(flight), tmp_path / "log.npz")
+    out = tmp_path / "found.csv"
+    said = run("identify", GAINS, path, "-p", "K_A", "-p", "K_B", "-o", out)
+    assert said.code == 0, said.err
+    found = read_response(out, "S x1")
+    assert compare_response(CONTROLLER, found, parameters=true.parameters).error.max() < 0.01
+    assert compare_response(CONTROLLER, found).error.max() > 0.02
+    assert found.to_control().ninputs == 1
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Run
+from conftest import Run, one_sentence
 
 import malta
 from malta.identification import log_files
@@ -182,6 +182,36 @@ def test_a_picture_has_envelope_spectrum_and_excited_lines_of_each_signal() -> N
     assert f.f[f.amplitude.argmax()] == pytest.approx(40, rel=0.03)
     figure = log_figure(log)
     assert [axes.get_ylabel() for axes in figure.axes] == ["x [µm]", "", "exc. f [N]", ""]
+
+
+def test_a_spectrogram_says_when_which_tone_is_there() -> None:
+    """A force of 3 N that goes from 200 to 1000 Hz in the middle, and a reading that is zero, or not there."""
+    t = 1e-4 * np.arange(20_000)
+    force = 3 * np.sin(2 * np.pi * np.where(t < 1, 200, 1000) * t)
+    signals = {"y": (Signal("x", "m"), Signal("n", "m")), "v": (Signal("f", "N"),)}
+    columns = {"y": np.column_stack([0 * t, np.nan * t]), "v": force[:, None]}
+    figure = log_figure(
+        malta.identification.Log("made", "", "", 1e-4, 0.0, 5 + t, columns, signals), spectrogram=True
+    )
+    (axes,) = (one for one in figure.axes if one.get_ylabel() == "f [N]")
+    drawn = figure.axes[figure.axes.index(axes) + 1]
+    assert (drawn.get_xlabel(), drawn.get_ylabel(), drawn.get_yscale()) == ("time [s]", "f [Hz]", "log")
+    assert "dB of 1 N" in [one.get_ylabel() for one in figure.axes]
+    mesh: Any = drawn.collections[0]
+    level, corners = np.asarray(mesh.get_array()), mesh.get_coordinates()
+    begins, f = corners[0, :-1, 0], corners[:-1, 0, 1]
+    for when, tone in ((5.4, 200.0), (6.6, 1000.0)):
+        column = level[:, np.searchsorted(begins, when)]
+        assert column.max() == pytest.approx(20 * np.log10(3), abs=1.5)  # a tone between two bins
+        assert f[column.argmax()] == pytest.approx(tone, abs=40)
+    assert level.min() < -20
+
+
+def test_a_spectrogram_wants_a_picture(run: Run, tmp_path: Path) -> None:
+    for options in ((), ("--out", tmp_path / "log.html")):
+        refused = run("log", "log.csv", "--spectrogram", *options)
+        assert refused.code == 2
+        assert "expected" in one_sentence(refused.err)
 
 
 def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.identification.Log) -> None:

@@ -504,6 +504,31 @@ class ResponseOutput(DocumentPart):
     refusal: str = Field(description='why the response is not as predicted; "": it is')
 
 
+class RealizeOutput(DocumentPart):
+    """What `malta identify GAINS LOG --order N --json` prints: x+ = A x + B v, y = C x, y late by the delay."""
+
+    READS: ClassVar = {
+        **{name: f"system.{name}" for name in "ABC"}, "logs": "lines.source", "sample_time_s": "system.dt"
+    }  # fmt: skip
+
+    kind: Literal["malta-realize-output"] = Field(default="malta-realize-output", alias="schema")
+    version: Literal[1] = 1
+    gains: Name
+    logs: str
+    order: int
+    sample_time_s: float
+    delay_s: float
+    singular_values: list[float]
+    chi2: Number = Field(description="1 where noise alone is left")
+    fit: dict[str, float] = Field(description="by output, at the lines, %")
+    fresh_fit: dict[str, float] | None = Field(description="of a second log, %")
+    A: list[list[float]]
+    B: list[list[float]]
+    C: list[list[float]]
+    refusal: str = Field(description='why the second log refuses the model; "": it does not')
+    files: Files
+
+
 class CommissionFinding(DocumentPart):
     """A figure of a step, with half of its 95 % interval and its limits."""
 
