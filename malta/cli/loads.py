@@ -37,6 +37,7 @@ from malta.files import PICTURES
 if TYPE_CHECKING:
     from malta.loops.loop import Loop
     from malta.margins.load_sizes import LoadLimit
+    from malta.model.vibration import VibrationPreset
 
 
 def loads(
@@ -62,6 +63,13 @@ def loads(
     noise: Annotated[
         float, typer.Option(metavar="N", help="Errors of readings are at most so many times their rms.")
     ] = 6.0,
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="api617, iso14839_2_a to c: shares of a clearance; workshop, office, vc_a to vc_e: floors, alone.",
+        ),
+    ] = None,
     time: WholeTime = None,
     out: Annotated[
         Path | None,
@@ -78,10 +86,12 @@ def loads(
 
     \b
     Example:  malta loads design/gains/robust.json --load F_x --load F_x+F_y
+              malta loads design/gains/robust.json --preset iso14839_2_a
     """
     from malta.loops.loop import loop as loop_of
     from malta.margins.load_sizes import load_limits
     from malta.model.plants import plant_of
+    from malta.model.vibration import vibration_preset
 
     require_suffixes((out, PICTURES))
     controller = read_controller(gains, machine)
@@ -90,15 +100,21 @@ def loads(
     box = read_uncertainty(gains, uncertain, plant.parameters) if uncertain else {}
     loop = loop_of(plant, controller)
     _require_stable(gains, loop)
+    bound = vibration_preset(preset) if preset else None
+    head = f"{gains}: {controller.name}, {plant.name}, preset {' '.join([plant.parameters.preset, *(change or ())])}"
+    if bound is not None and bound.velocity:
+        _print_floor(gains, loop, bound, head, as_json)
+        return
+    share = 1.0 if bound is None else bound.clearance
     with work_until("loads", time) as work:
-        found = load_limits(loop, asked, box, noise=noise, courses=out is not None)
+        found = load_limits(loop, asked, box, noise=noise, courses=out is not None, clearance=share)
     files = [] if out is None else _draw(controller.name, found, out)
     if as_json:
         from malta.cli.documents.loads import loads_output
 
         print_document(loads_output(gains, loop, found, box, files))
     else:
-        _print(gains, loop, found, box, change or ())
+        _print(head, loop, found, box, bound)
         print_written(make_console(), files)
     require_whole(work)
 
@@ -148,16 +164,32 @@ def _require_stable(gains: Path, loop: Loop) -> None:
         raise CheckError(f"{gains}: the loop (machine) is unstable, |lambda| = {radius:.6f}")
 
 
+def _print_floor(gains: Path, loop: Loop, floor: VibrationPreset, head: str, as_json: bool) -> None:
+    """Print how far a floor moves the machine, as a table or as a document."""
+    from malta.loops.floors import floor_motion
+
+    found, console = floor_motion(loop, floor.velocity), make_console()
+    if as_json:
+        from malta.cli.documents.loads import floor_output
+
+        print_document(floor_output(gains, loop, found))
+        return
+    from malta.report.tables.loads import floor_table
+
+    print_text(console, head)
+    console.print(floor_table(found, floor))
+    print_text(console, f"At most, of the linear loop at rest. Source: {floor.source}.")
+
+
 def _print(
-    gains: Path, loop: Loop, found: Sequence[LoadLimit], box: dict[str, float], changes: Sequence[str]
+    head: str, loop: Loop, found: Sequence[LoadLimit], box: dict[str, float], bound: VibrationPreset | None
 ) -> None:
     """Print the table, and what it is of."""
     from malta.model.parameters import box_words
     from malta.report.tables.loads import load_limits_table, load_limits_text, place_text
 
     console, par = make_console(), loop.plant.parameters
-    preset = f"{par.preset} {' '.join(changes)}".rstrip()
-    print_text(console, f"{gains}: {loop.controller.name}, {loop.plant.name}, preset {preset}")
+    print_text(console, head)
     console.print(load_limits_table(found))
     if box:
         print_text(
@@ -165,3 +197,5 @@ def _print(
             f"Anywhere in {box_words(box, par)}, which may move in flight; the linear loop is nominal.",
         )
     print_text(console, load_limits_text(found, place_text(loop)))
+    if bound is not None:
+        print_text(console, f"{bound.title}. Source: {bound.source}.")

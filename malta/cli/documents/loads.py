@@ -13,6 +13,7 @@ from malta.cli.documents.loops import DocumentPart, Files, Name, Number, Shares
 from malta.margins.load_sizes import COVERED, LEFT_OUT
 
 if TYPE_CHECKING:
+    from malta.loops.floors import FloorMotion
     from malta.loops.loop import Loop
     from malta.margins.load_sizes import LoadLimit
 
@@ -63,6 +64,16 @@ class LoadLimitPart(DocumentPart):
     )
 
 
+class FloorPart(DocumentPart):
+    """How far a floor that shakes along a load moves each output at most, rms, SI."""
+
+    along: str
+    mass: float = Field(description="kg")
+    outputs: list[SignalReach]
+    furthest: str
+    band: float = Field(description="Hz, of the band that adds most to the output `furthest`")
+
+
 class LoadsOutput(DocumentPart):
     """What `malta loads --json` prints."""
 
@@ -76,7 +87,9 @@ class LoadsOutput(DocumentPart):
     uncertainty: Shares
     noise: float = Field(description="errors of readings are at most so many times their rms")
     aside: list[SignalReach] = Field(description="states that the law leaves alone, at most")
+    clearance: float = Field(default=1.0, description="share of a clearance that may be used")
     loads: list[LoadLimitPart]
+    floors: list[FloorPart] = Field(default=[], description="with a preset of a floor, which has no loads")
 
 
 def loads_output(
@@ -91,9 +104,19 @@ def loads_output(
         left_out=LEFT_OUT,
         uncertainty=dict(box),
         noise=found[0].safe.noise,
+        clearance=found[0].safe.clearance,
         aside=_reaches(next((one.safe.aside for one in found if one.safe.limit is not None), {})),
         loads=[_limit_part(one) for one in found],
     )
+
+
+def floor_output(gains: Path, loop: Loop, found: Sequence[FloorMotion]) -> LoadsOutput:
+    """The document of a floor's motion."""
+    return LoadsOutput(
+        gains=str(gains), design=loop.controller.name, files=[], uncertainty={}, noise=0.0, aside=[], loads=[],
+        covered="the linear loop at rest", left_out="the noise of readings",
+        floors=[FloorPart(**one._asdict() | {"outputs": _reaches(one.outputs)}) for one in found],
+    )  # fmt: skip
 
 
 def _reaches(signals: Mapping[str, tuple[float, str]]) -> list[SignalReach]:

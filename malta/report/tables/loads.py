@@ -9,8 +9,10 @@ from rich.table import Table
 
 from malta.bound import at_most
 from malta.display import number, quantity
+from malta.loops.floors import FloorMotion
 from malta.loops.loop import Loop
 from malta.margins.load_sizes import COVERED, LEFT_OUT, LoadLimit
+from malta.model.vibration import VibrationPreset
 from malta.report.tables import add_row, new_sheet
 
 HEADS = (
@@ -46,7 +48,10 @@ def load_limits_table(found: Sequence[LoadLimit]) -> Table:
      w        0.301 N   f may reach its limit     15.63 %      29.38 %       2.91 N
     <BLANKLINE>
     """
-    table = new_sheet("Any load of at most this size touches nothing and saturates nothing", HEADS)
+    share = found[0].safe.clearance if found else 1.0
+    does = "touches nothing" if share == 1 else f"uses at most {100 * share:g} % of any clearance"
+    heads = HEADS if share == 1 else (*HEADS[:-1], ("linear loop uses more from", "right"))
+    table = new_sheet(f"Any load of at most this size {does} and saturates nothing", heads)
     for one in found:
         safe = one.safe
         proven = f"{one.proven.text()} {safe.unit}" if safe.limit is not None else "nothing"
@@ -69,6 +74,25 @@ def touch_text(found: LoadLimit) -> str:
     if math.isinf(found.touches):
         return "none"
     return f"{number(found.touches, 3)} {found.safe.unit}"
+
+
+FLOOR_HEADS = (
+    ("shakes along", "left"),
+    ("mass", "right"),
+    ("moves", "left"),
+    ("rms", "right"),
+    ("most at", "right"),
+)
+
+
+def floor_table(found: Sequence[FloorMotion], floor: VibrationPreset) -> Table:
+    """Tabulate the output that a floor moves furthest in each direction."""
+    each = f"{1e6 * floor.velocity:g} µm/s rms in each third of an octave, 8 to 80 Hz"
+    table = new_sheet(f"Floor of {floor.title}: {each}", FLOOR_HEADS)
+    for one in found:
+        rms, mass, band = quantity(*one.outputs[one.furthest]), quantity(one.mass, "kg"), f"{one.band:.3g} Hz"
+        add_row(table, one.along, mass, one.furthest, rms, band)
+    return table
 
 
 def load_limits_text(found: Sequence[LoadLimit], at: str = "") -> str:
