@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 
 from malta.app.files import Edited
-from malta.app.linear_run import LinearRun, linear_run
 from malta.arrays import FloatArray
 from malta.bound import at_most
 from malta.errors import CheckError, InputError
@@ -37,6 +36,7 @@ from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
 from malta.simulation.experiments.worst_load import worst_load_cases
+from malta.simulation.linear_run import LinearRun, linear_run
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 from malta.synthesis.step_response import StepResponse

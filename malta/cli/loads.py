@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,6 +41,10 @@ if TYPE_CHECKING:
     from malta.model.vibration import VibrationPreset
 
 
+PRESETS = "api617, iso14839_2_a to c: shares of a clearance; workshop, office, vc_a to vc_e: motion on such a floor."
+ROUNDING = 1e-13  # SI, of what is moved: less is rounding
+
+
 def loads(
     gains: GainFile,
     load: Annotated[
@@ -63,13 +68,10 @@ def loads(
     noise: Annotated[
         float, typer.Option(metavar="N", help="Errors of readings are at most so many times their rms.")
     ] = 6.0,
-    preset: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="api617, iso14839_2_a to c: shares of a clearance; workshop, office, vc_a to vc_e: floors, alone.",
-        ),
-    ] = None,
+    preset: Annotated[str | None, typer.Option(metavar="NAME", help=PRESETS)] = None,
+    requests: Annotated[
+        bool, typer.Option("--requests", help="How far any request drives the loop.")
+    ] = False,
     time: WholeTime = None,
     out: Annotated[
         Path | None,
@@ -102,8 +104,12 @@ def loads(
     _require_stable(gains, loop)
     bound = vibration_preset(preset) if preset else None
     head = f"{gains}: {controller.name}, {plant.name}, preset {' '.join([plant.parameters.preset, *(change or ())])}"
-    if bound is not None and bound.velocity:
-        _print_floor(gains, loop, bound, head, as_json)
+    if requests or (bound is not None and bound.velocity):
+        if asked or box or out:
+            raise InputError(
+                "malta loads", "", "--load, --uncertain or --out", "none with requests or a floor"
+            )
+        _print_linear(gains, loop, None if requests else bound, head, as_json)
         return
     share = 1.0 if bound is None else bound.clearance
     with work_until("loads", time) as work:
@@ -164,21 +170,49 @@ def _require_stable(gains: Path, loop: Loop) -> None:
         raise CheckError(f"{gains}: the loop (machine) is unstable, |lambda| = {radius:.6f}")
 
 
-def _print_floor(gains: Path, loop: Loop, floor: VibrationPreset, head: str, as_json: bool) -> None:
-    """Print how far a floor moves the machine, as a table or as a document."""
-    from malta.loops.floors import floor_motion
+def _print_linear(gains: Path, loop: Loop, floor: VibrationPreset | None, head: str, as_json: bool) -> None:
+    """Print how far a floor moves the linear loop, or how far requests drive it, as a table or as a document."""
+    from malta.cli.documents.loads import linear_output
+    from malta.report.tables.loads import reaches_table
 
-    found, console = floor_motion(loop, floor.velocity), make_console()
+    what, found = "Any request within limits of position, speed and acceleration", []
+    if floor is None:
+        found = _requests(loop)
+    else:
+        from malta.loops.floors import floor_motion
+
+        what = f"Floor of {floor.title}: {1e6 * floor.velocity:g} µm/s rms in each third of an octave, 8 to 80 Hz"
+        units = {s.name: s.unit for s in loop.plant.outputs}
+        moved = floor_motion(loop, floor.velocity).items()
+        found = [(along, name, x, units[name]) for along, of in moved for name, x in of.items()]
+    found = [one for one in found if one[2] > ROUNDING]
     if as_json:
-        from malta.cli.documents.loads import floor_output
-
-        print_document(floor_output(gains, loop, found))
+        print_document(linear_output(gains, loop.controller.name, what, found))
         return
-    from malta.report.tables.loads import floor_table
-
+    console = make_console()
     print_text(console, head)
-    console.print(floor_table(found, floor))
-    print_text(console, f"At most, of the linear loop at rest. Source: {floor.source}.")
+    console.print(reaches_table(what, found, " rms" if floor else ""))
+    told = f"Source: {floor.source}." if floor else "It holds while no command reaches its limit."
+    print_text(console, f"Of the linear loop at rest, at samples. {told}")
+
+
+def _requests(loop: Loop) -> list[tuple[str, str, float, str]]:
+    """Requests that the supervisor accepts, while no sum of errors waits: of what, what they drive, size and unit."""
+    from malta.display import quantity
+    from malta.firmware.signals import deepest_target
+    from malta.firmware.supervisor import reference_limits
+    from malta.simulation.requests import worst_request
+
+    c, found = loop.controller, []
+    for k, s in enumerate(loop.plant.outputs):
+        place, speed, bend = (float(limit[k]) for limit in reference_limits(deepest_target(c)))
+        pause = (1 - 1e-9) * c.pause[k] if c.pause.size else 0.0
+        within = place, min(speed, pause or math.inf), bend
+        text = ", ".join(quantity(x, s.unit + per) for x, per in zip(within, ("", "/s", "/s^2"), strict=True))
+        for output in (f"error {s.name}", *(one.name for one in loop.plant.inputs)):
+            worst = worst_request(loop, s.name, output, within)
+            found.append((f"{s.name} within {text}", output, worst.upper, worst.unit))
+    return found
 
 
 def _print(

@@ -14,21 +14,11 @@ CLEARANCE_PRESETS = ("api617", "iso14839_2_a", "iso14839_2_b", "iso14839_2_c")
 
 
 class VibrationPreset(NamedTuple):
-    """A bound of vibration, of the use of each clearance or of a floor.
-
-    title : in words
-    clearance : the largest share; 1: nothing is said of clearances
-    velocity : m/s, rms of a floor in each band of a third of an octave from 8 to 80 Hz; 0: nothing is said of a floor
-    source : of the number
-
-    >>> import malta
-    >>> malta.model.vibration_preset("iso14839_2_a").clearance
-    0.3
-    """
+    """A bound of vibration, of the use of each clearance or of a floor."""
 
     title: str
-    clearance: float
-    velocity: float
+    clearance: float  # largest share; 1: nothing is said of clearances
+    velocity: float  # m/s, rms of a floor in each band of a third of an octave; 0: nothing is said of a floor
     source: str
 
 
@@ -37,7 +27,8 @@ def vibration_preset(name: str) -> VibrationPreset:
 
     name : api617, iso14839_2_a to c, of clearances; workshop, office, vc_a to vc_e, of floors
 
-    Returns a VibrationPreset, in SI.
+    Returns its title, `clearance` (the largest share that may be used; 1: not bounded), `velocity` (m/s, rms of a floor
+    in each band of a third of an octave; 0: no floor) and source.
 
     Raises InputError for an unknown name.
 

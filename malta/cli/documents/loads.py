@@ -13,7 +13,6 @@ from malta.cli.documents.loops import DocumentPart, Files, Name, Number, Shares
 from malta.margins.load_sizes import COVERED, LEFT_OUT
 
 if TYPE_CHECKING:
-    from malta.loops.floors import FloorMotion
     from malta.loops.loop import Loop
     from malta.margins.load_sizes import LoadLimit
 
@@ -64,14 +63,13 @@ class LoadLimitPart(DocumentPart):
     )
 
 
-class FloorPart(DocumentPart):
-    """How far a floor that shakes along a load moves each output at most, rms, SI."""
+class LinearReach(DocumentPart):
+    """How far a signal of the linear loop goes at most, SI; on a floor rms."""
 
-    along: str
-    mass: float = Field(description="kg")
-    outputs: list[SignalReach]
-    furthest: str
-    band: float = Field(description="Hz, of the band that adds most to the output `furthest`")
+    by: str = Field(description="along which load the floor shakes, or of what a request is")
+    signal: str
+    value: float
+    unit: str
 
 
 class LoadsOutput(DocumentPart):
@@ -89,7 +87,7 @@ class LoadsOutput(DocumentPart):
     aside: list[SignalReach] = Field(description="states that the law leaves alone, at most")
     clearance: float = Field(default=1.0, description="share of a clearance that may be used")
     loads: list[LoadLimitPart]
-    floors: list[FloorPart] = Field(default=[], description="with a preset of a floor, which has no loads")
+    linear: list[LinearReach] = Field(default=[], description="with a floor or requests, and no loads then")
 
 
 def loads_output(
@@ -110,12 +108,14 @@ def loads_output(
     )
 
 
-def floor_output(gains: Path, loop: Loop, found: Sequence[FloorMotion]) -> LoadsOutput:
-    """The document of a floor's motion."""
+def linear_output(
+    gains: Path, name: str, what: str, found: Sequence[tuple[str, str, float, str]]
+) -> LoadsOutput:
+    """The document of what is of the linear loop alone, under a floor or requests."""
+    reaches = [LinearReach(by=by, signal=signal, value=x, unit=unit) for by, signal, x, unit in found]
     return LoadsOutput(
-        gains=str(gains), design=loop.controller.name, files=[], uncertainty={}, noise=0.0, aside=[], loads=[],
-        covered="the linear loop at rest", left_out="the noise of readings",
-        floors=[FloorPart(**one._asdict() | {"outputs": _reaches(one.outputs)}) for one in found],
+        gains=str(gains), design=name, files=[], covered=f"{what}; of the linear loop at rest, at samples",
+        left_out="noise", uncertainty={}, noise=0.0, aside=[], loads=[], linear=reaches,
     )  # fmt: skip
 
 

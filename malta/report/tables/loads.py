@@ -9,11 +9,10 @@ from rich.table import Table
 
 from malta.bound import at_most
 from malta.display import number, quantity
-from malta.loops.floors import FloorMotion
 from malta.loops.loop import Loop
 from malta.margins.load_sizes import COVERED, LEFT_OUT, LoadLimit
-from malta.model.vibration import VibrationPreset
 from malta.report.tables import add_row, new_sheet
+from malta.units import FINE_UNITS, in_unit
 
 HEADS = (
     ("load", "left"),
@@ -76,22 +75,12 @@ def touch_text(found: LoadLimit) -> str:
     return f"{number(found.touches, 3)} {found.safe.unit}"
 
 
-FLOOR_HEADS = (
-    ("shakes along", "left"),
-    ("mass", "right"),
-    ("moves", "left"),
-    ("rms", "right"),
-    ("most at", "right"),
-)
-
-
-def floor_table(found: Sequence[FloorMotion], floor: VibrationPreset) -> Table:
-    """Tabulate the output that a floor moves furthest in each direction."""
-    each = f"{1e6 * floor.velocity:g} µm/s rms in each third of an octave, 8 to 80 Hz"
-    table = new_sheet(f"Floor of {floor.title}: {each}", FLOOR_HEADS)
-    for one in found:
-        rms, mass, band = quantity(*one.outputs[one.furthest]), quantity(one.mass, "kg"), f"{one.band:.3g} Hz"
-        add_row(table, one.along, mass, one.furthest, rms, band)
+def reaches_table(title: str, found: Iterable[tuple[str, str, float, str]], rms: str = "") -> Table:
+    """Tabulate how far signals go at most: by what, signal, size and unit."""
+    table = new_sheet(title, (("by", "left"), ("signal", "left"), ("at most", "right")))
+    for by, signal, size, unit in found:
+        fine = FINE_UNITS.get(unit, unit)
+        add_row(table, by, signal, f"{at_most(size).text(factor=in_unit(1.0, fine))} {fine}{rms}")
     return table
 
 
