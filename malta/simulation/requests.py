@@ -87,8 +87,7 @@ def worst_request(loop: Loop, reference: str, output: str, limits: Sequence[floa
         raise InputError(CALLER, "loop", "currents that follow the reference's speed", "a law without them")
     if not loop.stable:
         raise CheckError(f"{c.name}: an unstable loop moves without limit")
-    answer = _answer(loop, j, k)
-    value, upper, motion = _solve(answer, (P, V, A), loop.sample_time)
+    value, upper, motion = _solve(_answer(loop, j, k), (P, V, A), loop.sample_time)
     t = loop.sample_time * np.arange(motion.shape[1])
     return WorstRequest(value, upper, signals[k].unit, readonly(t), readonly(motion))
 
@@ -138,8 +137,7 @@ def _answer(loop: Loop, j: int, k: int) -> _Answer:
 
 def _solve(y: _Answer, limits: tuple[float, float, float], T: float) -> tuple[float, float, FloatArray]:
     """The largest y of a request with one acceleration in each block, a bound of all requests, and this request."""
-    from scipy import sparse  # 0.2 s to load
-    from scipy.optimize import linprog
+    from scipy import optimize, sparse  # 0.2 s to load
 
     (P, V, A), reached = limits, np.cumsum(np.abs(y.response))
     h = np.pad(y.response, (0, int(np.ceil(V / (A * T))) + 1))  # it may begin by gaining speed
@@ -151,28 +149,29 @@ def _solve(y: _Answer, limits: tuple[float, float, float], T: float) -> tuple[fl
     apart, mean, H = here - older, sparse.diags(T * n / 2) @ (here + older), np.add.reduceat(h, edges[:-1])
     cost = np.concatenate([(H / (T * n)) @ apart, np.zeros(B + 1)])
     cost[[0, B + 1]] += y.to_speed, y.to_place
+    cost *= np.repeat([V, P], B + 1)  # all speeds and positions are shares of their limits
+    scale = float(np.abs(cost).max()) or 1.0
     turns: Any = sparse.hstack([sparse.vstack([apart, -apart]), sparse.csr_matrix((2 * B, B + 1))])
-    moves: Any = sparse.hstack([-mean, apart])
-    found, steps = list[Any](), np.tile(A * T * n, 2)
-    for end in (V, 0.0):  # the bound is of all speeds before the response, the request begins at rest
-        bounds = [*[(-V, V)] * B, (-end, end), *[(-P, P)] * (B + 1)]
-        found.append(linprog(-cost, turns, steps, moves, np.zeros(B), bounds, method="highs"))
-    if any(one.status for one in found):
-        raise CheckError(f"the linear program of requests has no answer: {found[0].message}")
-    block = np.repeat(np.arange(B), n)
-    (up, down), slow = -found[0].ineqlin.marginals.reshape(2, B), -found[0].eqlin.marginals[block]
-    middle = (edges[:-1] + (n - 1) / 2)[block]
+    moves: Any = sparse.hstack([-V / P * mean, apart])
+    found, steps = list[Any](), np.tile(A * T / V * n, 2)
+    for end in (1, 0):  # the bound is of all speeds before the response, the request begins at rest
+        bounds = [*[(-1, 1)] * B, (-end, end), *[(-1, 1)] * (B + 1)]
+        found.append(optimize.linprog(-cost / scale, turns, steps, moves, np.zeros(B), bounds))
+    if failed := [one.message for one in found if one.status]:
+        raise CheckError(f"the linear program of requests has no answer: {failed[0]}")
+    block, middle = np.repeat(np.arange(B), n), np.repeat(edges[:-1] + (n - 1) / 2, n)
+    up, down = -scale / V * found[0].ineqlin.marginals.reshape(2, B)
+    slow = -scale / P * found[0].eqlin.marginals[block]
     c = (H / n - T * (up - down))[block] - T**2 * slow * (np.arange(len(h)) - middle)
     by_speed = np.diff(c, prepend=-T * y.to_speed, append=0.0) / T
     by_speed += T / 2 * (np.append(slow, 0) + np.append(0, slow))
     by_place = np.diff(slow, prepend=y.to_place, append=0.0)
     upper = A * (np.abs(h - c).sum() + y.tail) + V * np.abs(by_speed).sum() + P * np.abs(by_place).sum()
-    u, start = found[1].x[: B + 1], found[1].x[-1]
+    u, start = V * found[1].x[: B + 1], P * found[1].x[-1]
     a = (-np.diff(u) / (T * n))[block][::-1]
     speed = np.cumsum(T * np.append(0, a))
     place = start + np.append(0, np.cumsum(T / 2 * (speed[1:] + speed[:-1])))
     motion = np.array([place, speed, np.append(0, a)])
-    within = min(
-        1.0, *(limits / np.abs(motion).max(axis=1).clip(1e-300))
-    )  # positions are bounded at ends of blocks
-    return -within * float(found[1].fun), float(upper), within * motion
+    # Positions are bounded at the ends of blocks.
+    within = min(1.0, *(limits / np.abs(motion).max(axis=1).clip(1e-300)))
+    return -within * scale * float(found[1].fun), float(upper), within * motion

@@ -71,7 +71,7 @@ def flown_impulse(loop: Loop, axis: int, samples: int, size: float) -> np.ndarra
     [
         ("tubular_pid", 4, 2400, 10.0),
         pytest.param("robust", 0, 8000, 0.001, marks=pytest.mark.slow),
-        pytest.param("planar", 2, 120, 5.0, marks=pytest.mark.slow),
+        pytest.param("planar", 2, 120, 0.01, marks=pytest.mark.slow),
     ],
 )
 def test_a_bang_bang_adversary_from_a_flown_impulse_reaches_the_bound(
@@ -85,7 +85,7 @@ def test_a_bang_bang_adversary_from_a_flown_impulse_reaches_the_bound(
     signal = loop.plant.outputs[axis].name
     found = malta.worst_request(loop, signal, f"error {signal}", (place, speed, size))
     reached = np.abs(errors(fly(loop, reference, samples), reference, axis)).max()
-    assert 0.95 * found.upper < reached <= found.upper
+    assert 0.95 * found.upper < reached <= found.upper * (1 + 1e-5)  # the machine is not linear
     assert 0.95 * found.upper < found.value <= found.upper
 
 
@@ -187,6 +187,16 @@ def test_bounds_grow_with_limits_and_scale_with_them() -> None:
     slower = malta.worst_request(loop, "z", "error z", (0.01, 0.05, 20.0))
     nearer = malta.worst_request(loop, "z", "error z", (0.0005, 0.5, 20.0))
     assert max(slower.upper, nearer.upper) < 0.95 * small.upper
+
+
+def test_small_limits_of_a_slow_loop_are_bounded_too() -> None:
+    """The program is in shares of the limits: in SI its positions would be below the tolerances of its solver."""
+    spec = malta.read_design("examples/ball/design/ball_pid.toml")
+    loop = malta.loop(spec.plant, malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at())))
+    for size in (1.0, 1e-4):
+        found = malta.worst_request(loop, "y", "error y", (1e-4 * size, 0.01 * size, size))
+        assert found.upper == pytest.approx(6.0477e-5 * size, rel=1e-3)
+        assert 0.95 * found.upper < found.value <= found.upper
 
 
 @pytest.mark.parametrize(
