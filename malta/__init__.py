@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
     from malta.simulation.experiments.catalogue import experiment as experiment
+    from malta.simulation.requests import worst_request as worst_request
     from malta.simulation.scenario import Scenario as Scenario
     from malta.simulation.simulate import simulate as simulate
     from malta.synthesis.design_file import read_design as read_design
@@ -115,6 +116,7 @@ _NAMES = {
     "malta.report.ledger": "ledger",
     "malta.simulation": "references",
     "malta.simulation.experiments.catalogue": "experiment",
+    "malta.simulation.requests": "worst_request",
     "malta.simulation.scenario": "Scenario",
     "malta.simulation.simulate": "simulate",
     "malta.synthesis.design_file": "read_design",

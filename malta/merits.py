@@ -49,11 +49,11 @@ MEANINGS: dict[str, Meaning] = {
     "damping": Meaning("bandwidth and poles", "high", "loop"),
     "motion": Meaning("noise at rest", "low", "machine"),
     "command": Meaning("noise at rest", "low", "machine"),
+    "load_any": Meaning("a load of any waveform", "low", "machine", bound=at_most),
+    "load_safe": Meaning("a load of any waveform", "high", "machine", bound=at_least),
     "load_moves": Meaning("a constant load from outside", "low", "machine"),
-    "load_any": Meaning("a constant load from outside", "low", "machine"),
     "load_settles": Meaning("a constant load from outside", "low", "machine", "s"),
     "compliance": Meaning("a constant load from outside", "low", "machine"),
-    "load_safe": Meaning("a load of any waveform", "high", "machine", bound=at_least),
     "job": Meaning("main job", "low", "machine"),
     "yield": Meaning("campaign", "high", "box", "percent"),
     "runs": Meaning("campaign", "low", "box"),
@@ -115,16 +115,16 @@ class Merit(NamedTuple):
         """The value in its unit, with four digits; a frequency in Hz too."""
         if self.kind == "stable":
             return "yes" if self.value else "NO"
+        factor, _ = ROOTS.get(self.unit) or (in_unit(1.0, self.unit), "")
         if self.meaning.bound is not None:
             shown = self.meaning.bound(self.value)
-            return shown.percent(unit="") if self.unit == "percent" else shown.text()
+            return shown.percent(unit="") if self.unit == "percent" else shown.text(factor=factor)
         if math.isnan(self.value):
             return "none"
         if math.isinf(self.value):
             return "never" if self.kind == "load_settles" else "any"
         if self.is_frequency:
             return frequency(self.value)
-        factor, _ = ROOTS.get(self.unit) or (in_unit(1.0, self.unit), "")
         return four_digits(factor * self.value)
 
     @property

@@ -17,13 +17,13 @@ import casadi as ca
 import numpy as np
 
 from malta.app.files import Edited
-from malta.app.linear_run import LinearRun, linear_run
 from malta.arrays import FloatArray
 from malta.bound import at_most
 from malta.errors import CheckError, InputError
 from malta.loops.classical import phase_and_delay
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
+from malta.loops.waveforms import bound_any_waveform
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport, pole_figures, zone
 from malta.margins.margin_map import margin_map_of, plane_of
 from malta.margins.travel import travel_loops
@@ -36,6 +36,7 @@ from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
 from malta.simulation.experiments.worst_load import worst_load_cases
+from malta.simulation.linear_run import LinearRun, linear_run
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 from malta.synthesis.step_response import StepResponse
@@ -260,6 +261,7 @@ def _load(problem: PictureSubject, view: View) -> dict[str, Any] | None:
         "t": round_values(t),
         "y": round_values(y),
         "largest": round_values(one.largest[:, 0]),
+        "any": round_values(bound_any_waveform(problem.loop, np.eye(len(names))[k])),
     }
 
 
@@ -433,7 +435,8 @@ def _time_merits(
         error = np.abs(np.array(run["p"]) - np.array(run["reference"])).max(axis=1)
         merits += _worst_by_unit("job", f"error, {run['name']}", error.tolist(), outputs)
     if load is not None:
-        merits += _worst_by_unit("load_moves", f"moved by {load['name']}", load["largest"], outputs)
+        merits += _worst_by_unit("load_any", f"moved by {load['name']}, any waveform", load["any"], outputs)
+        merits += _worst_by_unit("load_moves", f"moved by {load['name']}, a step", load["largest"], outputs)
     return merits
 
 

@@ -13,6 +13,7 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.loops.curves import LoopCurves as LoopCurves, loop_curves as loop_curves
+    from malta.loops.floors import floor_motion as floor_motion
     from malta.loops.linear_loops import LoopSystems as LoopSystems, loop_systems as loop_systems
     from malta.loops.loop import Loop as Loop
     from malta.loops.noise import NoisePeaks as NoisePeaks, noise_peaks as noise_peaks
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "malta.loops.curves": "LoopCurves loop_curves",
+    "malta.loops.floors": "floor_motion",
     "malta.loops.linear_loops": "LoopSystems loop_systems",
     "malta.loops.loop": "Loop",
     "malta.loops.noise": "NoisePeaks noise_peaks",

@@ -66,17 +66,17 @@ class Clearance(NamedTuple):
                     found = ClearanceUse(share, n, k)
         return found
 
-    def size_at_touch(self, responses: Sequence[FloatArray]) -> float:
-        """The size of a load from which on some waveform of it uses up the clearance; infinite where none does."""
-        if self.rest >= 1:
+    def size_at_share(self, responses: Sequence[FloatArray], limit: float = 1.0) -> float:
+        """The size of a load from which on some waveform of it uses a share of the clearance; infinite: none does."""
+        if self.rest >= limit:
             return 0.0
         size = 1.0
         for _ in range(TOUCHES):  # a share grows by more than in proportion
             share, n, _ = self.most(size, responses)
             if not len(n) or share - self.rest < LEAST_SHARE:
                 return math.inf
-            size *= (1 - self.rest) / (share - self.rest)
-            if abs(share - 1) < TOUCH_SHARE:
+            size *= (limit - self.rest) / (share - self.rest)
+            if abs(share - limit) < TOUCH_SHARE:
                 break
         return size
 

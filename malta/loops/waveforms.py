@@ -162,8 +162,10 @@ def bound_any_waveform(loop: Loop, shares: FloatArray) -> FloatArray:
     return l1_bounds(*channel[:4])
 
 
-def largest_load(loop: Loop, disturbance: str | Mapping[str, float]) -> tuple[float, str]:
+def largest_load(loop: Loop, disturbance: str | Mapping[str, float], limit: float = 1.0) -> tuple[float, str]:
     """How large a load may be, whatever its waveform, before a contact is touched, SI; and this contact.
+
+    limit : share of a clearance that may be used; 1: what touches ends it
 
     Infinite where none is touched. Of the linear loop at rest; contacts by their own formula.
 
@@ -174,10 +176,10 @@ def largest_load(loop: Loop, disturbance: str | Mapping[str, float]) -> tuple[fl
         raise InputError(loop.plant.name, "contacts", "none", "a machine with contacts, to be touched")
     clearances, responses = _clearances(loop, disturbance)
     ranked = sorted(clearances, key=lambda one: -one.share_of_rest(1.0, responses))
-    found = ranked[0].size_at_touch(responses), ranked[0].name
+    found = ranked[0].size_at_share(responses, limit), ranked[0].name
     for one in ranked[1:]:  # few are touched before the one of which a small load uses most
-        if math.isfinite(found[0]) and one.most(found[0], responses).share >= 1:
-            found = min(found, (one.size_at_touch(responses), one.name))
+        if math.isfinite(found[0]) and one.most(found[0], responses).share >= limit:
+            found = min(found, (one.size_at_share(responses, limit), one.name))
     return found
 
 

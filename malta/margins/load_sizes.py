@@ -47,7 +47,8 @@ class LoadLimit:
     """How large a load may be, whatever its waveform.
 
     safe : what is proven of the nonlinear machine, a SafeLoad
-    touches : from which size on some waveform of it makes the linear loop touch, SI; infinite: none; NaN: not computed
+    touches : from which size on some waveform of it makes the linear loop touch, or use more of a clearance than is
+        allowed, SI; infinite: none; NaN: not computed
     contact : what is touched then
     course : a LoadCourse, where it was asked for and anything is proven
     """
@@ -73,7 +74,8 @@ class LoadLimit:
         own = self.safe.description
         if not math.isfinite(self.touches):
             return own
-        touches = f"touches from {quantity(self.touches, self.safe.unit)} on: {self.contact}"
+        reaches = "touches" if self.safe.clearance == 1 else "uses more"
+        touches = f"{reaches} from {quantity(self.touches, self.safe.unit)} on: {self.contact}"
         return Description(own.title, (*own.rows[:1], ("linear loop", touches), *own.rows[1:]))
 
 
@@ -86,12 +88,13 @@ def load_limits(
     noise: float = NOISE,
     aside: float | Mapping[str, float] = ASIDE,
     courses: bool = False,
+    clearance: float = 1.0,
 ) -> tuple[LoadLimit, ...]:
     """Prove how large each load on a machine may be, and look where the linear loop touches.
 
     loop : from `malta.loop`
     loads : each as of `malta.safe_load`; None: each of the machine's disturbances
-    ranges, noise, aside : as of `malta.safe_load`; the linear loop is nominal
+    ranges, noise, aside, clearance : as of `malta.safe_load`; the linear loop is nominal
     courses : whether the use of clearance over the size is asked for, of the first load of each unit that is proven
 
     Returns a LoadLimit for each load. Where the time is up, nothing is known of those that are left.
@@ -113,11 +116,12 @@ def load_limits(
         where = (plant.name, "disturbances") if loads is None else (CALLER, "loads")
         raise InputError(*where, "none", "a load, a force that acts from outside")
     found, drawn = list[LoadLimit](), set[str]()
-    for load, (safe, near) in zip(asked, answers(loop, asked, ranges, noise=noise, aside=aside), strict=True):
+    proofs = answers(loop, asked, ranges, noise=noise, aside=aside, clearance=clearance)
+    for load, (safe, near) in zip(asked, proofs, strict=True):
         single = isinstance(load, str | Mapping) and loop.stable and not is_stopped()
         touches, contact = (math.nan, "")
         if single and plant.contacts.names:
-            touches, contact = largest_load(loop, load)  # type: ignore[arg-type]
+            touches, contact = largest_load(loop, load, clearance)  # type: ignore[arg-type]
         course = None
         if courses and single and near is not None and safe.used and safe.unit not in drawn:
             course = _course(loop, load, safe, near, touches)  # type: ignore[arg-type]

@@ -378,8 +378,8 @@ def _loads(a: LoopReport) -> Iterator[Merit]:
         settled = f"{size}: within 1 % after"
         peak = f"{size}: largest over frequency"
         moved, any_waveform = f"{size}: largest deviation", f"any waveform of {size}: at most"
-        yield figure("load_moves", f"{name} largest", moved, output.largest, fine, load.name)
         yield figure("load_any", f"{name} any waveform", any_waveform, output.any_waveform, fine, load.name)
+        yield figure("load_moves", f"{name} largest", moved, output.largest, fine, load.name)
         yield figure("load_settles", f"{name} settles", settled, output.settled, signal=load.name)
         yield figure("compliance", f"{name} compliance", peak, output.compliance, fine, load.name)
 

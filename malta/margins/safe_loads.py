@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +51,7 @@ class SafeLoad:
     outputs : of each output by name, how far it goes at most under `limit`, with its unit
     used : of each contact by name, the share of its clearance that is used at most
     forces : of each command by name, the share of its limit
+    clearance : the largest share of a clearance that was allowed; 1: what touches ends it
     """
 
     disturbance: str
@@ -63,6 +64,7 @@ class SafeLoad:
     outputs: Mapping[str, tuple[float, str]]
     used: Mapping[str, float]
     forces: Mapping[str, float]
+    clearance: float = 1.0
 
     @property
     def proven(self) -> Bound:
@@ -92,7 +94,9 @@ class SafeLoad:
         if self.unit == START:
             title = f"From {asked} {self.disturbance} nothing is touched, nothing saturates"
         else:
-            title = f"No {self.disturbance} of at most {asked} touches or saturates anything"
+            more = f"uses more than {100 * self.clearance:g} % of a clearance or"
+            does = "touches or" if self.clearance == 1 else more
+            title = f"No {self.disturbance} of at most {asked} {does} saturates anything"
         return Description(title, tuple(rows))
 
 
@@ -104,6 +108,7 @@ def safe_load(
     *,
     noise: float = NOISE,
     aside: float | Mapping[str, float] = ASIDE,
+    clearance: float = 1.0,
 ) -> SafeLoad:
     """Prove how large a load may be, whatever its waveform, before the nonlinear machine may touch or saturate.
 
@@ -121,11 +126,12 @@ def safe_load(
         readings by their resolution are within half of it
     aside : how far states that the law leaves alone and that act on the others are from rest at most, SI, as the roll
         of a shaft; one number, or by name
+    clearance : the largest share of each clearance that may be used, as that of `malta.model.vibration_preset`
 
     Returns a SafeLoad, of the machine with forces as `fidelity="force"` flies them: what its coils are held at, through
     the lags of its current loops. Induced voltages and the DC link's are not in it.
 
-    Raises InputError for a load that the machine has not, and for `noise` below 0.
+    Raises InputError for a load that the machine has not, for `noise` below 0, and for a share that is none.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/structured.json")
@@ -136,7 +142,7 @@ def safe_load(
     """
     if not isinstance(loop, Loop):
         raise InputError(CALLER, "loop", describe(loop), "a Loop, from malta.loop")
-    ((found, _),) = answers(loop, [disturbance], ranges, noise=noise, aside=aside)
+    ((found, _),) = answers(loop, [disturbance], ranges, noise=noise, aside=aside, clearance=clearance)
     return found
 
 
@@ -147,15 +153,20 @@ def answers(
     *,
     noise: float = NOISE,
     aside: float | Mapping[str, float] = ASIDE,
+    clearance: float = 1.0,
 ) -> Iterator[tuple[SafeLoad, Surroundings | None]]:
     """`safe_load` of several loads, whose norms are computed at once, each with what it was proven in.
 
     Where the time is up, nothing is proven of those that are left. Raises InputError as `safe_load`.
     """
+    if not 0 < number(CALLER, "clearance", clearance) <= 1:
+        raise InputError(CALLER, "clearance", f"{clearance:g}", "a share above 0 and up to 1")
     none = np.zeros((len(loop.model.A), 0))
     asked = [_SizeQuestion(*_loads_of(loop, one), none) for one in disturbances]
     for what, near in zip(asked, _surroundings(CALLER, loop, asked, ranges, noise, aside), strict=True):
-        found = _answer_to(what, near, noise)
+        if isinstance(near, Surroundings):
+            near = replace(near, clearance=clearance)
+        found = replace(_answer_to(what, near, noise), clearance=clearance)
         yield found, near if isinstance(near, Surroundings) and found.limit is not None else None
 
 
@@ -340,9 +351,10 @@ def bounds_under(near: Surroundings, X: float) -> tuple[FloatArray, FloatArray]:
     """How far signals go under a load of at most X, and shares of clearances. Raises Unproven where one is used up."""
     T = held_set(near.norms, near.noise * near.norms.noise, X, lambda Z: near.remainders(X, Z))
     used = near.clearances(X, T)
-    if (used >= 1).any():
-        names = near.machine.source.plant.contacts.names
-        raise Unproven(f"{names[int((used >= 1).argmax())]} may be touched")
+    if (used >= near.clearance).any():
+        name = near.machine.source.plant.contacts.names[int((used >= near.clearance).argmax())]
+        more = f"use more than {100 * near.clearance:g} % of its clearance"
+        raise Unproven(f"{name} may {'be touched' if near.clearance == 1 else more}")
     return T, used
 
 

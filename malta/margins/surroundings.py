@@ -279,6 +279,7 @@ class Surroundings:
     norms: SignalNorms
     noise: float
     aside: FloatArray
+    clearance: float = 1.0  # largest share of each that may be used; 1: what touches ends it
     known: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)  # second slopes over sets
 
     @cached_property

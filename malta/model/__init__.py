@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from malta.model.printed import read_published as read_published
     from malta.model.sensors import Sensors as Sensors
     from malta.model.stroke import Stroke as Stroke
+    from malta.model.vibration import vibration_preset as vibration_preset
     from malta.units import in_unit as in_unit
 
 _NAMES = {
@@ -28,6 +29,7 @@ _NAMES = {
     "malta.model.printed": "read_published",
     "malta.model.sensors": "Sensors",
     "malta.model.stroke": "Stroke",
+    "malta.model.vibration": "vibration_preset",
     "malta.units": "in_unit",
 }
 __all__, __getattr__, __dir__ = contents(

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 from malta.arrays import ComplexArray, FloatArray
 from malta.model.parts import attribute_of
 from malta.model.plant import Parameters, Plant, Signal
+from malta.model.vibration import CLEARANCE_PRESETS, vibration_preset
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 Trade = Literal["force", "motion"]
 Form = Literal["number", "switch", "outputs", "inputs", "disturbances", "loads"]
 Verdict = Literal["holds", "fails", "undecided"]
+# Keys of [specification] that bound loads of any waveform, with the preset of vibration that says what they may use.
+CLEARANCES_OF = {"never_touches": "", **{f"within_{name}": name for name in CLEARANCE_PRESETS}}
 Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
 SEEDS = (4, 8, 16, 32)  # numbers of seeds after which a simulated figure is compared with its bound
 
@@ -89,8 +92,8 @@ class Design(Protocol):
     def deviation(self, bound: RecoveryBound) -> Figure:
         """Under a constant load from outside, of the machine's linear loop: what the bound is of."""
 
-    def largest_load(self, disturbance: str) -> Figure:
-        """The largest load that touches no contact, whatever its waveform: of the machine's linear loop."""
+    def largest_load(self, disturbance: str, limit: float) -> Figure:
+        """The largest load of any waveform that uses no more than a share of a clearance: of the linear loop."""
 
     def fly(self, name: str, **options: Any) -> Any:
         """Run an experiment of the machine by name: simulation.experiments.Experiment."""
@@ -117,8 +120,9 @@ class TrialFigures:
     # of w (rad/s), p and x: the true outputs, p complex amplitudes, while the reference is p exp(jwt) and the states
     # that go with it are x exp(jwt)
     follow: Callable[[float, FloatArray, ComplexArray], ComplexArray]
-    # of any waveform of a disturbance: the size that touches no contact which these states move; None: none is moved
-    largest_load: Callable[[str], float | None]
+    # of any waveform of a disturbance: the size that uses no more than a share of the clearance of any contact which
+    # these states move; None: none is moved
+    largest_load: Callable[[str, float], float | None]
 
 
 Measure = Callable[[Design, float, str], Sequence[Figure]]  # of a bound that is asked for, of a signal or ""
@@ -258,6 +262,24 @@ def _index(signals: Sequence[Signal], name: str) -> list[int]:
     return [k for k, s in enumerate(signals) if s.name == name]
 
 
+def _bounded_clearance(key: str, preset: str) -> Requirement:
+    """A bound of loads of any waveform that use no more of a clearance than a preset allows; "": touch nothing."""
+
+    def share() -> float:
+        return vibration_preset(preset).clearance if preset else 1.0
+
+    words = f"keeps clearances within {preset}" if preset else "no contact is touched by"
+    return Requirement(
+        key,
+        lambda design, _asked, signal: [design.largest_load(signal, share())],
+        at_least=True,
+        laws=("LQG", "PID"),
+        form="disturbances",
+        estimate=lambda trial, signal: trial.largest_load(signal, share()),
+        meaning=f"load of any waveform that {words}, of the linear loop, at least",
+    )
+
+
 GENERIC_REQUIREMENTS = (
     Requirement(
         "noise_motion",
@@ -306,15 +328,7 @@ GENERIC_REQUIREMENTS = (
         estimate=_recovery_estimate,
         meaning="what a constant load from outside does, by the name of a load",
     ),
-    Requirement(
-        "never_touches",
-        lambda design, _asked, signal: [design.largest_load(signal)],
-        at_least=True,
-        laws=("LQG", "PID"),
-        form="disturbances",
-        estimate=lambda trial, signal: trial.largest_load(signal),
-        meaning="load of any waveform that no contact is touched by, of the linear loop, at least",
-    ),
+    *(_bounded_clearance(key, preset) for key, preset in CLEARANCES_OF.items()),
     noise_at_rest(
         "motion",
         "motion",

@@ -395,10 +395,10 @@ def _pushes(spec: Spec, outputs: Any, places: Sequence[StrokePlace]) -> tuple[An
         if push.any() and names & set(bound.outputs):
             bounds.append((bound.after or 0.0, bound.anywhere, bound.limit, push.tobytes()))
     names_of_loads = [s.name for s in spec.plant.disturbances]
-    for name, size in asked_loads(spec).items():
+    for key, name, size in asked_loads(spec):
         push = np.abs(places[0].pushed[:, names_of_loads.index(name)]).round(15)
         if push.any():
-            bounds.append((math.inf, False, size, push.tobytes()))
+            bounds.append((math.inf, False, size, key.encode() + push.tobytes()))
     machines = (np.abs(place.machine.Ad).round(12).tobytes() for place in places)
     return (*sorted(bounds), *machines)
 
@@ -577,12 +577,16 @@ def _pushed_loop(
 
 
 def _largest_load(
-    plant: Plant, group: TuningGroup, pushed: Sequence[tuple[FloatArray, FloatArray]], disturbance: str
+    plant: Plant,
+    group: TuningGroup,
+    pushed: Sequence[tuple[FloatArray, FloatArray]],
+    disturbance: str,
+    limit: float,
 ) -> float | None:
     """`TrialFigures.largest_load` of a trial, at the operating point."""
     k = [s.name for s in plant.disturbances].index(disturbance)
     closed, left = pushed[0]
-    return largest_trial_load(group.contacts, closed, left[:, k], len(group.states))
+    return largest_trial_load(group.contacts, closed, left[:, k], len(group.states), limit)
 
 
 def _answer(place: StrokePlace, closed: FloatArray, pushed: FloatArray, Ts: float) -> StepResponse:

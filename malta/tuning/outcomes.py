@@ -85,9 +85,9 @@ class SynthesizedDesign:
             return Figure(worst, f"linear loop, at {1e3 * position:.3g} mm")
         return Figure(bounded_deviation(self.plant, self.controller, bound), "linear loop")
 
-    def largest_load(self, disturbance: str) -> Figure:
-        """The largest load that touches no contact, whatever its waveform, at the operating point."""
-        size, contact = largest_load(self.loop, disturbance)
+    def largest_load(self, disturbance: str, limit: float) -> Figure:
+        """The largest load of any waveform that uses no more of a clearance, at the operating point."""
+        size, contact = largest_load(self.loop, disturbance, limit)
         return Figure(size, f"linear loop, to {contact}")
 
     def fly(self, name: str, **options: Any) -> Experiment:

@@ -10,19 +10,17 @@ import numpy as np
 
 from malta.linear.impulses import impulses
 from malta.loops.clearances import Clearance, clearances_of
+from malta.synthesis.requirements import CLEARANCES_OF
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.synthesis.spec import Spec
 
-KEY = "never_touches"  # of [specification]
 
-
-def asked_loads(spec: Spec) -> dict[str, float]:
-    """The loads by name, with the size that may touch nothing."""
-    return {
-        key.partition(" ")[2]: size for key, size in spec.specification.items() if key.startswith(f"{KEY} ")
-    }
+def asked_loads(spec: Spec) -> tuple[tuple[str, str, float], ...]:
+    """The loads of any waveform that are asked for: key of [specification], load, size."""
+    keys = ((*key.partition(" ")[::2], size) for key, size in spec.specification.items())
+    return tuple(one for one in keys if one[0] in CLEARANCES_OF)
 
 
 def touched_contacts(spec: Spec, x0: FloatArray, states: Sequence[int]) -> tuple[Clearance, ...]:
@@ -33,17 +31,18 @@ def touched_contacts(spec: Spec, x0: FloatArray, states: Sequence[int]) -> tuple
 
 
 def largest_trial_load(
-    contacts: Sequence[Clearance], closed: FloatArray, pushed: FloatArray, states: int
+    contacts: Sequence[Clearance], closed: FloatArray, pushed: FloatArray, states: int, limit: float
 ) -> float | None:
     """The largest load, held over each sample, that touches none of some contacts; None: it moves none of them.
 
     closed : of the machine and its law, n x n; the design states are the first
     pushed : what a unit load leaves in the states in a sample, n
+    limit : share of a clearance, which counts as touched
 
     Raises CheckError for an unstable loop.
     """
     if not contacts or not pushed.any():
         return None
     found = impulses(closed, np.eye(states, len(closed)), pushed[:, None], np.zeros((states, 1)))
-    size = min(one.size_at_touch([found.values]) for one in contacts)
+    size = min(one.size_at_share([found.values], limit) for one in contacts)
     return size if math.isfinite(size) else None

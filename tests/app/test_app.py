@@ -85,6 +85,7 @@ def test_picture_has_the_figures_of_verify_and_recovery(design: Path) -> None:
     if found["load"]:
         of_load = malta.loops.recovery(problem.plant, problem.controller)[0]
         assert found["load"]["largest"] == pytest.approx([d.largest for d in of_load.outputs], rel=1e-5)
+        assert found["load"]["any"] == pytest.approx([d.any_waveform for d in of_load.outputs], rel=1e-5)
     assert np.array_equal(problem.controller.K, malta.synthesize(spec, problem.model).K)
 
 

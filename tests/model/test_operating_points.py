@@ -12,7 +12,6 @@ import pytest
 from magnets import BENCH, MACHINES, bench, two_coils
 
 import malta
-from malta.app.linear_run import linear_run
 from malta.linear.expressions import program
 from malta.loops.parametric_loops import machine_system
 from malta.loops.parametric_plants import of_plant
@@ -21,6 +20,7 @@ from malta.loops.sampled_loops import loaded_model, machine_loop
 from malta.model.equilibrium import with_command
 from malta.model.plant import OperatingPoint
 from malta.simulation.experiments.payloads import held_payload
+from malta.simulation.linear_run import linear_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable

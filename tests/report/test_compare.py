@@ -55,6 +55,21 @@ def test_what_never_settles_is_said_so() -> None:
     assert figure("delay_margin", "k", "delay margin", float("inf")).text == "any"
 
 
+def test_what_any_waveform_does_at_most_is_rounded_up_in_its_unit_and_stands_before_the_step() -> None:
+    assert figure("load_any", "", "any waveform of 1 N F_x: at most", 1.97846e-5, "um").text == "19.79"
+    assert figure("load_moves", "", "1 N F_x: largest deviation", 1.97846e-5, "um").text == "19.78"
+    spec = read_design("examples/ball/design/ball.toml")
+    model = linearize(spec.plant, spec.plant.at())
+    found = {one.key: one for one in linear_report(model, synthesize(spec, model), {}).figures}
+    worst, step = found["load w any waveform"], found["load w largest"]
+    assert (worst.meaning.group, step.meaning.group) == (
+        "a load of any waveform",
+        "a constant load from outside",
+    )
+    assert worst.value > step.value > 0
+    assert [*found].index(worst.key) < [*found].index(step.key)
+
+
 def row_of(found: Comparison, key: str) -> MeritRow:
     (row,) = [one for one in found.rows if one.key == key]
     return row

@@ -63,6 +63,15 @@ class LoadLimitPart(DocumentPart):
     )
 
 
+class LinearReach(DocumentPart):
+    """How far a signal of the linear loop goes at most, SI; on a floor rms."""
+
+    by: str = Field(description="along which load the floor shakes, or of what a request is")
+    signal: str
+    value: float
+    unit: str
+
+
 class LoadsOutput(DocumentPart):
     """What `malta loads --json` prints."""
 
@@ -76,7 +85,9 @@ class LoadsOutput(DocumentPart):
     uncertainty: Shares
     noise: float = Field(description="errors of readings are at most so many times their rms")
     aside: list[SignalReach] = Field(description="states that the law leaves alone, at most")
+    clearance: float = Field(default=1.0, description="share of a clearance that may be used")
     loads: list[LoadLimitPart]
+    linear: list[LinearReach] = Field(default=[], description="with a floor or requests, and no loads then")
 
 
 def loads_output(
@@ -91,9 +102,21 @@ def loads_output(
         left_out=LEFT_OUT,
         uncertainty=dict(box),
         noise=found[0].safe.noise,
+        clearance=found[0].safe.clearance,
         aside=_reaches(next((one.safe.aside for one in found if one.safe.limit is not None), {})),
         loads=[_limit_part(one) for one in found],
     )
+
+
+def linear_output(
+    gains: Path, name: str, what: str, found: Sequence[tuple[str, str, float, str]]
+) -> LoadsOutput:
+    """The document of what is of the linear loop alone, under a floor or requests."""
+    reaches = [LinearReach(by=by, signal=signal, value=x, unit=unit) for by, signal, x, unit in found]
+    return LoadsOutput(
+        gains=str(gains), design=name, files=[], covered=f"{what}; of the linear loop at rest, at samples",
+        left_out="noise", uncertainty={}, noise=0.0, aside=[], loads=[], linear=reaches,
+    )  # fmt: skip
 
 
 def _reaches(signals: Mapping[str, tuple[float, str]]) -> list[SignalReach]:

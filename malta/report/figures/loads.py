@@ -55,7 +55,7 @@ def _draw(axes: Axes, found: LoadLimit, course: LoadCourse) -> None:
     axes.plot(course.linear[0], 100 * course.linear[1], label="linear loop", **STYLES[2])
     axes.axvline(course.sizes[-1], **BOUND_STYLE)
     if math.isfinite(found.touches):
-        draw_bound(axes, 100, "touched")
+        draw_bound(axes, 100 * found.safe.clearance, "touched" if found.safe.clearance == 1 else "allowed")
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
     label = f"any {found.safe.disturbance} of at most [{found.safe.unit}]"

@@ -12,6 +12,7 @@ from malta.display import number, quantity
 from malta.loops.loop import Loop
 from malta.margins.load_sizes import COVERED, LEFT_OUT, LoadLimit
 from malta.report.tables import add_row, new_sheet
+from malta.units import FINE_UNITS, in_unit
 
 HEADS = (
     ("load", "left"),
@@ -46,7 +47,10 @@ def load_limits_table(found: Sequence[LoadLimit]) -> Table:
      w        0.301 N   f may reach its limit     15.63 %      29.38 %       2.91 N
     <BLANKLINE>
     """
-    table = new_sheet("Any load of at most this size touches nothing and saturates nothing", HEADS)
+    share = found[0].safe.clearance if found else 1.0
+    does = "touches nothing" if share == 1 else f"uses at most {100 * share:g} % of any clearance"
+    heads = HEADS if share == 1 else (*HEADS[:-1], ("linear loop uses more from", "right"))
+    table = new_sheet(f"Any load of at most this size {does} and saturates nothing", heads)
     for one in found:
         safe = one.safe
         proven = f"{one.proven.text()} {safe.unit}" if safe.limit is not None else "nothing"
@@ -69,6 +73,15 @@ def touch_text(found: LoadLimit) -> str:
     if math.isinf(found.touches):
         return "none"
     return f"{number(found.touches, 3)} {found.safe.unit}"
+
+
+def reaches_table(title: str, found: Iterable[tuple[str, str, float, str]], rms: str = "") -> Table:
+    """Tabulate how far signals go at most: by what, signal, size and unit."""
+    table = new_sheet(title, (("by", "left"), ("signal", "left"), ("at most", "right")))
+    for by, signal, size, unit in found:
+        fine = FINE_UNITS.get(unit, unit)
+        add_row(table, by, signal, f"{at_most(size).text(factor=in_unit(1.0, fine))} {fine}{rms}")
+    return table
 
 
 def load_limits_text(found: Sequence[LoadLimit], at: str = "") -> str:

@@ -50,11 +50,11 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
     t = np.arange(samples) * c.sample_time
     motion = motion_of(scenario, plant, c, t)
     here = outputs_at(plant, plant.point(c.operating_point[0]).x)
-    r = _references(c, motion, here)
+    r = law_references(c, motion, here)
     closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
     n, m = len(loop.Ad), len(c.forces)
     with np.errstate(all="ignore"):  # an unstable loop runs away
-        rest = _at_rest(closed, driven[0])
+        rest = solve_rest(closed, driven[0])
         if scenario.disturbance is not None and loop.pushed is not None:
             driven[:, :n] += np.asarray(scenario.disturbance(t)) @ loop.pushed.T
         X = _follow(closed, driven, rest)
@@ -88,7 +88,7 @@ def _follow(closed: FloatArray, driven: FloatArray, state: FloatArray) -> FloatA
     return np.asarray(X.reshape(-1, n)[:samples])
 
 
-def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
+def solve_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
     """The states of which X = M X + G r, for a reference that stands still."""
     left = np.eye(len(closed)) - closed
     try:
@@ -97,7 +97,7 @@ def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.lstsq(left, driven, rcond=None)[0])
 
 
-def _references(c: Controller, motion: Motion, here: FloatArray) -> FloatArray:
+def law_references(c: Controller, motion: Motion, here: FloatArray) -> FloatArray:
     """r = (p*, xi*, v_ff, v0) at every sample, as deviations from the operating point; v0 follows the readings."""
     v_ff, hold = feedforward(c, motion), c.feedforward.position
     if hold.size:  # at the operating point it is no deviation
