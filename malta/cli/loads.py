@@ -102,7 +102,7 @@ def loads(
     box = read_uncertainty(gains, uncertain, plant.parameters) if uncertain else {}
     loop = loop_of(plant, controller)
     _require_stable(gains, loop)
-    bound = vibration_preset(preset) if preset else None
+    bound = vibration_preset(preset, "--preset") if preset is not None else None
     head = f"{gains}: {controller.name}, {plant.name}, preset {' '.join([plant.parameters.preset, *(change or ())])}"
     if requests or (bound is not None and bound.velocity):
         if asked or box or out:

@@ -22,10 +22,11 @@ class VibrationPreset(NamedTuple):
     source: str
 
 
-def vibration_preset(name: str) -> VibrationPreset:
+def vibration_preset(name: str, caller: str = "vibration_preset") -> VibrationPreset:
     """Read a bound of vibration by name: data/published/vibration.toml, where each has its source.
 
     name : api617, iso14839_2_a to c, of clearances; workshop, office, vc_a to vc_e, of floors
+    caller : whom a refusal names
 
     Returns its title, `clearance` (the largest share that may be used; 1: not bounded), `velocity` (m/s, rms of a floor
     in each band of a third of an octave; 0: no floor) and source.
@@ -38,7 +39,7 @@ def vibration_preset(name: str) -> VibrationPreset:
     'VC-C: 12.5 um/s'
     """
     known = _presets()
-    require_known([name], known, "vibration_preset", "name")
+    require_known([name], known, caller, "")
     return known[name]
 
 
