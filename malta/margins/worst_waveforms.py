@@ -40,7 +40,7 @@ def worst_waveform(
 
     loop : from `malta.loop`
     disturbance : a load by name, N or N m; a load at a point as {"F_x": 1, "T_y": -0.045}, of which `limit` is the
-        multiple; "noise x1", the error of a sensor in each sample; "rate z", of a reference
+        multiple; "noise x1", the error of a sensor in each sample; "rate z", of a reference by position alone
     output : an output or an input of the plant by name, "error z" of an output beside its reference, or a contact
         (share of its clearance, 1 touches)
     limit : largest size of the signal, SI
