@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -128,9 +129,9 @@ def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> No
     assert len(lines) >= 12
     for line in lines:
         if line.startswith("malta app"):
-            assert_serves(program, tmp_path, *line.split())
+            assert_serves(program, tmp_path, *shlex.split(line))
             continue
-        done = run(program, tmp_path, *SHORTER.get(line, line).split())
+        done = run(program, tmp_path, *shlex.split(SHORTER.get(line, line)))
         extra = "--study sensitivity" in line and "pip install 'malta[sensitivity]'" in done.stderr
         if OF_PAPERS.search(line):
             assert "malta-papers: pip install ./papers" in done.stderr
@@ -197,5 +198,5 @@ def test_papers_are_found_once_they_are_installed(program: Path, tmp_path: Path)
     ]
     assert len(lines) >= 3
     for line in lines:
-        done = run(program, tmp_path, *SHORTER.get(line, line).split())
+        done = run(program, tmp_path, *shlex.split(SHORTER.get(line, line)))
         assert (done.returncode, "Traceback" in done.stderr) == (0, False), (line, done.stderr)
