@@ -19,7 +19,7 @@ import heapq
 import itertools
 import math
 import time as clock
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -92,8 +92,8 @@ class _Point(NamedTuple):
     size: FloatArray  # of the rates of the plant with its lags, entry by entry
     unit: FloatArray  # of these inputs, likewise
     into: FloatArray  # of what commands add to them
-    within: tuple[
-        tuple[Enclosed, Enclosed], ...
+    within: Sequence[
+        tuple[Enclosed, Enclosed]
     ]  # e^(A t) - 1 and the integral of e^(A t) B, at times in a sample
 
 
@@ -207,13 +207,8 @@ class _LoadedLoop:
                 [*((i, k, 1) for k, i in enumerate(units)), *((i, len(units), v) for i, _, v in b)],
             )  # fmt: skip
             columns, spread = push_in_parts(a, unit, self.T, parts)
-            point = (
-                M.part(kept, kept),
-                sizes_of(a),
-                sizes_of(unit),
-                sizes_of(into),
-                _within_sample(a, into, self.T),
-            )
+            within = _within_sample(a, into, self.T) if units else ()  # a vertex is looked at at samples
+            point = M.part(kept, kept), sizes_of(a), sizes_of(unit), sizes_of(into), within
         blank = np.zeros((len(M.mid) - x, len(units) + 1))
         whole = [Enclosed(*(np.vstack([part, blank])[kept] for part in one)) for one in columns]
         closed = Enclosed(point[0].mid + np.eye(len(kept)), point[0].rad)
@@ -285,15 +280,17 @@ class _LoadedLoop:
             rows += [Enclosed(output, 0 * output), _times(Enclosed(V, 0 * V), signals), X, U]
         every = self._row_norms(point, _stack_enclosed(*rows)).reshape(len(point.within), -1, k)
         since, found = np.zeros((x, k)), np.zeros((first + V.shape[1], k))
+        next_time = point.within[-1 if len(every) < 2 else 1][
+            0
+        ]  # with one time nothing is carried to another
+        carried = np.abs(next_time.mid + np.eye(x)) + next_time.rad
         for N in every:
             at = N[first : first + x] + since
             more = since + UP * (grown @ at + into[:, :k] + into[:, k:] @ N[first + x :])
             N[1:first] += UP * np.abs(V[:, :x]) @ more
             N[first : first + x] += more
             found = np.maximum(found, N[: len(found)])
-            if len(every) > 1:
-                E = point.within[1][0]
-                since = UP * ((np.abs(E.mid + np.eye(x)) + E.rad) @ since + into[:, :k])
+            since = UP * (carried @ since + into[:, :k])
         return found
 
     def _enclosed_inputs(self) -> Enclosed:
